@@ -21,7 +21,7 @@ from benchmarks.hidden.classes import CLASSES, StudyClass, draw_record, find_cla
 from benchmarks.hidden.score import confusion_table, failures, main_table, reliability_table
 from benchmarks.hidden.suspects import SuspectsJudged, judge_suspects
 from reactorwatch.diagnosis.diagnose import diagnose
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import cstr
 from reactorwatch.runtime.parallel.jobs import Failed
 from tests.hidden_effect.draw import draw
 from tests.hidden_effect.judge import Judged, failed, judge

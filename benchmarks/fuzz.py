@@ -33,7 +33,7 @@ from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import MESSAGES, Encoded, Publication, encode, encode_message, encoding_of
 from reactorwatch.errors import InputError
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import cstr
 from reactorwatch.runtime.config import SECTIONS, BusConfig, read_settings, section
 from recorder.config import RecorderConfig
 from recorder.core import Recorder

@@ -12,8 +12,7 @@ from time import perf_counter
 import numpy as np
 
 from benchmarks.study_figures.neural import Neural
-from reactorwatch.identification.families import LINEAR_FAMILIES, Family
-from reactorwatch.identification.selection import select
+from reactorwatch.identification.selection import LINEAR_FITS, select
 from reactorwatch.identification.structure import Structure
 
 
@@ -25,18 +24,18 @@ def main() -> None:
         print(f"skipped: no DaISy record at {file}")
         return
     time, qc, *outputs = np.loadtxt(file, delimiter=",", skiprows=1).T
-    families: tuple[Family, ...] = LINEAR_FAMILIES
+    fits = dict(LINEAR_FITS)
     if importlib.util.find_spec("sklearn") is not None:
-        families = (*families, Neural())
-    for family in LINEAR_FAMILIES:
-        family.fit(Structure.of_order(1), qc[:200], outputs[0][:200])  # compiles, or loads what was compiled
+        fits["neural"] = Neural().fit
+    for fit in LINEAR_FITS.values():
+        fit(Structure.of_order(1), qc[:200], outputs[0][:200])  # compiles, or loads what was compiled
     for name, output in zip("CT", outputs, strict=True):
-        selection = select(qc, output, time, families)
+        selection = select(qc, output, time, fits)
         print(f"{name}\n{selection.table()}\n{selection.reason}")
-        for family in families:
+        for family, fit in fits.items():
             start = perf_counter()
-            family.fit(Structure.of_order(3), qc[:3750], output[:3750], time[:3750])
-            print(f"  fitting {family.name} of order 3 to 3,750 rows: {1e3 * (perf_counter() - start):.0f} ms")
+            fit(Structure.of_order(3), qc[:3750], output[:3750], time[:3750])
+            print(f"  fitting {family} of order 3 to 3,750 rows: {1e3 * (perf_counter() - start):.0f} ms")
 
 
 if __name__ == "__main__":

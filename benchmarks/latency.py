@@ -22,7 +22,7 @@ from reactorwatch.cli.processes import write_settings
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication, decode, encode
 from reactorwatch.contract.messages_pb2 import Alarm, AlarmState, Quality, Sample
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import cstr
 from reactorwatch.records.record import to_time_ns
 from reactorwatch.runtime.bus_zenoh import connect, router
 from reactorwatch.runtime.config import BusConfig

@@ -30,7 +30,7 @@ from plant_node.record import simulate_record
 from reactorwatch.contract.codec import encode
 from reactorwatch.contract.messages_pb2 import Sample
 from reactorwatch.kalman.ekf_step import NoiseLevels
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import cstr
 from recorder.tools.player import samples_of
 
 RUNS = 300

@@ -21,7 +21,7 @@ from benchmarks.harness.timing import fastest
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from reactorwatch.arrays import Array
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import cstr
 from reactorwatch.process.simulate import Simulator
 
 REPEATS = 9

@@ -16,8 +16,7 @@ from monitor_node.ingest.duplicates import AlignmentMemory
 from monitor_node.ingest.intake import IntakeMemory
 from monitor_node.watch.pipeline import PipelineMemory
 from reactorwatch.errors import InputError
-from reactorwatch.process.fingerprint import fingerprint
-from reactorwatch.process.model import ProcessModel
+from reactorwatch.process.model import ProcessModel, fingerprint
 from reactorwatch.version import this_build
 
 DIGEST_BYTES = 16

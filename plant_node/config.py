@@ -14,11 +14,10 @@ from reactorwatch.contract.keys import DEFAULT_PLANT, check_plant
 from reactorwatch.description.process import Process, Signal
 from reactorwatch.errors import InputError, describe_unknown, prefix_errors
 from reactorwatch.process import OPERATIONS
-from reactorwatch.process.controller import ContinuousController, Controller
 from reactorwatch.process.fault import FaultSpecification, parse_fault
-from reactorwatch.process.library.cstr.controllers import LevelControl, TemperatureControl
+from reactorwatch.process.library.cstr_operation import LevelControl, TemperatureControl
 from reactorwatch.process.model import ProcessModel
-from reactorwatch.process.operation import InputLevels
+from reactorwatch.process.operation import ContinuousController, Controller, InputLevels
 from reactorwatch.runtime.setting_rules import MODEL_IS_PROCESS, OlderKeys, check_bounds
 from reactorwatch.units import conversion
 

@@ -26,8 +26,8 @@ from reactorwatch.description.process import Process
 from reactorwatch.errors import InputError, prefix_errors
 from reactorwatch.process.effect import TIMING
 from reactorwatch.process.fault import FaultSpecification
-from reactorwatch.process.integrate import SimulationError, Stepper
 from reactorwatch.process.model import ProcessModel
+from reactorwatch.process.simulate import SimulationError, Stepper
 from reactorwatch.process.steady_state import complete_state, start_state
 from reactorwatch.records.record import to_minutes, to_time_ns
 

@@ -14,8 +14,8 @@ from msgspec.structs import replace as with_changes
 from numpy.typing import NDArray
 
 from reactorwatch.errors import InputError
-from reactorwatch.process.controller import Controller
 from reactorwatch.process.model import ProcessModel, Variable, variable
+from reactorwatch.process.operation import Controller
 
 BLOCK = 1024  # rows
 

@@ -15,14 +15,20 @@ if TYPE_CHECKING:
     from reactorwatch.api.simulation import simulate
     from reactorwatch.description.process import Process, Signal
     from reactorwatch.errors import InputError
-    from reactorwatch.process.model import ProcessModel
+    from reactorwatch.process.effect import Effect
+    from reactorwatch.process.model import Output, Place, ProcessModel, new_clock, parameter, variable
+    from reactorwatch.process.operation import Controller
     from reactorwatch.spc.charts import catalogue as charts
 
     __version__: str
 
 _MODULES = {
+    "Controller": "reactorwatch.process.operation",
+    "Effect": "reactorwatch.process.effect",
     "InputError": "reactorwatch.errors",
     "Monitor": "reactorwatch.api.monitor",
+    "Output": "reactorwatch.process.model",
+    "Place": "reactorwatch.process.model",
     "Process": "reactorwatch.description.process",
     "ProcessModel": "reactorwatch.process.model",
     "Record": "reactorwatch.api.records",
@@ -32,15 +38,22 @@ _MODULES = {
     "diagnose": "reactorwatch.api.diagnosis",
     "effects": "reactorwatch.api.records",
     "identify": "reactorwatch.api.identification",
+    "new_clock": "reactorwatch.process.model",
+    "parameter": "reactorwatch.process.model",
     "processes": "reactorwatch.api.records",
     "read_record": "reactorwatch.api.records",
     "simulate": "reactorwatch.api.simulation",
+    "variable": "reactorwatch.process.model",
 }
 """Modules of the public names; `charts` is one itself."""
 
 __all__ = [
+    "Controller",
+    "Effect",
     "InputError",
     "Monitor",
+    "Output",
+    "Place",
     "Process",
     "ProcessModel",
     "Record",
@@ -50,9 +63,12 @@ __all__ = [
     "diagnose",
     "effects",
     "identify",
+    "new_clock",
+    "parameter",
     "processes",
     "read_record",
     "simulate",
+    "variable",
 ]
 
 

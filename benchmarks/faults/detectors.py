@@ -12,6 +12,7 @@ distribution, because the residuals are neither independent nor normal where a l
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from math import inf
 from typing import NamedTuple
 
@@ -25,9 +26,8 @@ from monitor_node.config import MonitorConfig
 from monitor_node.replay import backtest
 from reactorwatch.arrays import Array
 from reactorwatch.contract.messages_pb2 import Alarm, Incident, Suspect
-from reactorwatch.identification.batch import fit_arx
+from reactorwatch.identification.linear import fit_linear
 from reactorwatch.identification.linear_model import LinearModel
-from reactorwatch.identification.output_error import fit_oe
 from reactorwatch.identification.structure import Structure
 from reactorwatch.records.record import Record, to_minutes
 
@@ -96,7 +96,10 @@ class ReportMethod:
         return worst
 
 
-METHODS: tuple[ReportMethod, ...] = (ReportMethod("ARX", fit_arx), ReportMethod("OE", fit_oe))
+METHODS: tuple[ReportMethod, ...] = (
+    ReportMethod("ARX", partial(fit_linear, "arx")),
+    ReportMethod("OE", partial(fit_linear, "oe")),
+)
 
 
 def alarms_of(time_min: Array, statistic: Array, width: float) -> list[Interval]:

@@ -43,8 +43,8 @@ from benchmarks.harness.bank import (
 from monitor_node.causes.isolation import causes_of
 from reactorwatch.arrays import Array
 from reactorwatch.process.effect import Effect
-from reactorwatch.process.integrate import SimulationError
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import cstr
+from reactorwatch.process.simulate import SimulationError
 from reactorwatch.records.record import Record
 
 CAUSES = causes_of(cstr())

@@ -20,7 +20,7 @@ from plant_node.record import simulate_record
 from plant_node.scenario import RandomSteps
 from reactorwatch.arrays import Array
 from reactorwatch.process.fault import parse_fault
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import cstr
 from reactorwatch.process.simulate import Simulator
 from reactorwatch.process.steady_state import start_state
 from reactorwatch.records.record import Record

@@ -12,7 +12,7 @@ import numpy as np
 from monitor_node.config import MonitorConfig, ReferenceName
 from reactorwatch.arrays import Array
 from reactorwatch.contract.codec import Encoded, encode
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import cstr
 from reactorwatch.process.simulate import Simulator
 from reactorwatch.process.steady_state import start_state
 from reactorwatch.records.record import Record

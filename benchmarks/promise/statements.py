@@ -16,12 +16,11 @@ from monitor_node.replay import backtest
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from reactorwatch.contract.codec import Encoded
-from reactorwatch.spc.baseline import Baseline
-from reactorwatch.spc.charts.ewma import Ewma, designed_limit
+from reactorwatch.spc.charts.base import Baseline
+from reactorwatch.spc.charts.ewma import Ewma, designed_limit, ewma_run_length
 from reactorwatch.spc.charts.shewhart import Shewhart, designed_width
+from reactorwatch.spc.false_alarm_budget import QUANTILE, TrainingErrors
 from reactorwatch.spc.prewhitening import Prewhitening, learn
-from reactorwatch.spc.run_length.ewma import ewma
-from reactorwatch.spc.training_errors import QUANTILE, TrainingErrors
 
 PLANTS, TRAININGS, COEFFICIENTS = 1000, (100, 1000, 5000), (0.0, 0.5)
 ARL0, WEIGHT = 20_000.0, 0.1
@@ -105,7 +104,7 @@ def _true_rates(learned: Prewhitening, coefficient: float) -> tuple[float, float
     averaged = lfilter([WEIGHT], [1.0, WEIGHT - 1.0], response)
     spread = float(np.sqrt(averaged @ averaged * (2.0 - WEIGHT) / WEIGHT))
     limit = min(designed_limit(ARL0, WEIGHT, learned) / spread, 6.0)  # beyond, the rate is nothing
-    return point * ARL0, ARL0 / ewma(abs(mean) / spread, WEIGHT, limit)
+    return point * ARL0, ARL0 / ewma_run_length(abs(mean) / spread, WEIGHT, limit)
 
 
 def stated_sizes() -> dict[str, float]:

@@ -19,12 +19,11 @@ from benchmarks.study_figures.figure import (
 from benchmarks.study_figures.study import NAMES, Study
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
-from reactorwatch.process.library.cstr.controllers import GAIN, TemperatureControl
-from reactorwatch.process.library.cstr.level_control import GAIN as LEVEL_GAIN
-from reactorwatch.process.library.cstr.level_control import with_level_control
-from reactorwatch.process.library.cstr.model import OPERATING_COOLANT_FLOW, OPERATING_STATE
+from reactorwatch.process.library.cstr import OPERATING_COOLANT_FLOW, OPERATING_STATE
+from reactorwatch.process.library.cstr_operation import LevelControl, TemperatureControl
 from reactorwatch.process.simulate import Simulator
 
+GAIN, LEVEL_GAIN = TemperatureControl().gain_l_min_K, LevelControl().gain_per_min
 _SET_POINT_STEP_K = 2.0
 _STEP_MIN, _END_MIN = 2.0, 10.0
 _GAINS = ((1.0, SKY, "--"), (GAIN, BLUE, "-"), (12.0, ORANGE, "-."))
@@ -80,7 +79,7 @@ def level(study: Study, drawing: Drawing) -> Finding:
     constant = study.simulator.run(time_min, inputs, start, inflow).states
     rows, distances, off = [], [], []
     for gain, colour, style in _LEVEL_GAINS:
-        model = with_level_control(study.model, gain)
+        model = LevelControl(gain).extend(study.model)
         states = Simulator(model).run(time_min, inputs, np.array([*start, volume]), inflow).states
         for_V.plot(time_min, states[:, 2], style, color=colour, label=f"gain {gain:g} 1/min")
         for_T.plot(time_min, states[:, 1], style, color=colour)

@@ -29,8 +29,8 @@ from monitor_node.replay import backtest
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from reactorwatch.arrays import Array
-from reactorwatch.process.library.cstr.model import cstr
-from reactorwatch.process.library.cstr.operation import NOISE_SD, ONSET_MIN, OPERATION
+from reactorwatch.process.library.cstr import cstr
+from reactorwatch.process.library.cstr_operation import NOISE_SD, ONSET_MIN, OPERATION
 from reactorwatch.records.record import Record, to_minutes
 from reactorwatch.spc.charts.shewhart import probability_out
 

@@ -33,13 +33,12 @@ from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from plant_node.scenario import RandomSteps
 from reactorwatch.errors import InputError
-from reactorwatch.identification.batch import fit_arx
-from reactorwatch.identification.excitation import Check, check_record, sampling
+from reactorwatch.identification.checks import Check, check_record, sampling
+from reactorwatch.identification.data import ScaledRecord, rows_of
+from reactorwatch.identification.linear import fit_linear
 from reactorwatch.identification.linear_model import LinearModel
-from reactorwatch.identification.regressor import rows_of
-from reactorwatch.identification.scaled_record import ScaledRecord
 from reactorwatch.identification.structure import Structure, as_columns
-from reactorwatch.process.library.cstr.operation import OPERATION
+from reactorwatch.process.library.cstr_operation import OPERATION
 from reactorwatch.records.record import Record
 
 OUTSIDE_THREE_SIGMA = 0.0027
@@ -88,7 +87,7 @@ def follow(
     if not rate.passed:
         return Conclusion("sample again", tuple(branches))
 
-    model = fit_arx(structure, *training)
+    model = fit_linear("arx", structure, *training)
     known = model.residuals(*training)[:, 0]
     known = known[np.isfinite(known)]
     centre, sigma = float(np.mean(known)), float(np.std(known, ddof=structure.parameters))

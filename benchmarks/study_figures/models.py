@@ -1,5 +1,7 @@
 """Figures 5, 6 and 11 to 16, and chapter 4: linear models on rows that they were not fitted to, and the best model."""
 
+from collections.abc import Mapping
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Drawing
@@ -18,13 +20,12 @@ from benchmarks.study_figures.figure import (
     verdict,
 )
 from benchmarks.study_figures.neural import Neural
-from benchmarks.study_figures.report_scheme import ORDER
+from benchmarks.study_figures.report_scheme import EVERY, ORDER, SKIP
 from benchmarks.study_figures.study import NAMES, ORDERS, OUTPUTS, Study, holdout_half
-from reactorwatch.identification.batch import SINGULAR_CONDITION
-from reactorwatch.identification.families import LINEAR_FAMILIES, Family
+from reactorwatch.identification.least_squares import SINGULAR_CONDITION
 from reactorwatch.identification.linear_model import LinearModel, fit_percent
-from reactorwatch.identification.selection import EQUAL_PERCENT, Candidate, Selection, select
-from reactorwatch.identification.structure import REPORT_ROWS, Structure
+from reactorwatch.identification.selection import EQUAL_PERCENT, LINEAR_FITS, Candidate, Fit, Selection, select
+from reactorwatch.identification.structure import Structure
 from reactorwatch.records.record import Record
 
 _SHOWN_MIN = 30.0
@@ -51,7 +52,7 @@ def estimate(study: Study, drawing: Drawing) -> Finding:
             rows.append(f"| {output} | {name} | {model.rows} | {condition} | {values} |")
     legend_below(drawing, axes[0], 2)
     text = (
-        f"The scheme in full: rows {REPORT_ROWS.skip + 1}, {REPORT_ROWS.skip + 1 + REPORT_ROWS.every}, ... are fitted, "
+        f"The scheme in full: rows {SKIP + 1}, {SKIP + 1 + EVERY}, ... are fitted, "
         "their lags are the rows just before them, and the pseudo-inverse solves. The report scales its signals "
         "and does not give the factors; here each is centred and divided by its standard deviation, and the "
         f"parameters below are those of the signals' own units. Fitted to the first half of {study.source}.\n\n"
@@ -185,14 +186,12 @@ _THIRD = 3
 
 def best_model(study: Study, drawing: Drawing) -> Finding:
     """Free-run and one-step fits of every family and order."""
-    families: list[Family] = [*LINEAR_FAMILIES, Neural()]
-    linear = list(LINEAR_FAMILIES)
-    records: dict[str, tuple[Record, list[Family]]] = {
-        study.source: (study.identification, families),
-        "the same run without noise": (study.noise_free, linear),
+    records: dict[str, tuple[Record, Mapping[str, Fit]]] = {
+        study.source: (study.identification, {**LINEAR_FITS, "neural": Neural().fit}),
+        "the same run without noise": (study.noise_free, LINEAR_FITS),
         "steps within 0.1 l/min of 100 l/min, without noise, where the plant is nearly linear": (
             study.small_steps,
-            linear,
+            LINEAR_FITS,
         ),
     }
     selections = {
@@ -220,9 +219,9 @@ class ThirdOrder:
 
     def __init__(self, selections: list[Selection]) -> None:
         groups = [
-            [candidate for candidate in selection.candidates if candidate.family == family.name]
+            [candidate for candidate in selection.candidates if candidate.family == family]
             for selection in selections
-            for family in LINEAR_FAMILIES
+            for family in LINEAR_FITS
         ]
         self.of = len(groups)
         self.one_step = sum(_ahead(group, "one_step_percent") >= 0 for group in groups)
@@ -265,8 +264,8 @@ def _gains(selections: dict[tuple[str, str], Selection], name: str) -> dict[tupl
         for candidate in selections[name, output].candidates
     }
     return {
-        (family.name, output): runs[family.name, _THIRD, output] - runs[family.name, _THIRD - 1, output]
-        for family in LINEAR_FAMILIES
+        (family, output): runs[family, _THIRD, output] - runs[family, _THIRD - 1, output]
+        for family in LINEAR_FITS
         for output in OUTPUTS
     }
 

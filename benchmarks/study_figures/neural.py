@@ -18,11 +18,9 @@ from numpy.typing import ArrayLike, NDArray
 from sklearn.exceptions import ConvergenceWarning  # type: ignore[import-untyped]
 from sklearn.neural_network import MLPRegressor  # type: ignore[import-untyped]
 
-from reactorwatch.identification.batch import fit_arx
+from reactorwatch.identification.data import ScaledRecord, plan_run, rows_of
+from reactorwatch.identification.linear import fit_linear
 from reactorwatch.identification.linear_model import LinearModel, fit_percent
-from reactorwatch.identification.regressor import rows_of
-from reactorwatch.identification.scaled_record import ScaledRecord
-from reactorwatch.identification.simulation import plan_run
 from reactorwatch.identification.structure import Scaling, Structure, as_columns
 
 _DIVERGED = 1e6  # a scaled output beyond this, a million times its spread, has diverged
@@ -59,7 +57,8 @@ class NeuralModel:
         u = scaling.inputs(as_columns(inputs, "inputs", structure.inputs))
         y = scaling.outputs(as_columns(outputs, "outputs", 1))
         plan = plan_run(structure, u, y, time)
-        theta = scaling.scale_parameters(structure, self.linear.parameters)
+        matrix, shift = scaling.unscaling(structure)
+        theta = np.linalg.solve(matrix, self.linear.parameters - shift)
         weights, constant = (theta[:-1], theta[-1]) if structure.offset else (theta, 0.0)
         spread = scaling.output_spreads[0]
         own, run = y[:, 0].copy(), np.full(y.shape, np.nan)
@@ -92,13 +91,12 @@ class Neural:
     neurons: int = 12  # number of neurons in the hidden layer
     seeds: tuple[int, ...] = (1, 2, 3)  # seeds of the initial weights; one network is fitted for each
     iterations: int = 200  # largest number of iterations of each search
-    name: str = "neural"
 
     def fit(
         self, structure: Structure, inputs: ArrayLike, outputs: ArrayLike, time: ArrayLike | None = None
     ) -> NeuralModel:
         """Fit the networks and choose the one with the best simulation."""
-        linear = fit_arx(structure, inputs, outputs, time)
+        linear = fit_linear("arx", structure, inputs, outputs, time)
         record = ScaledRecord.of(structure, inputs, outputs, time)
         # Without the constant: the network has its own.
         rows = replace(record, structure=structure.without_offset()).enough_rows()

@@ -20,8 +20,8 @@ from benchmarks.study_figures.figure import (
     verdict,
 )
 from benchmarks.study_figures.study import NAMES, Study, edge, row_times
-from reactorwatch.process.library.cstr.model import OPERATING_COOLANT_FLOW
-from reactorwatch.process.step_response import StepComparison, compare_step
+from reactorwatch.process.library.cstr import OPERATING_COOLANT_FLOW
+from reactorwatch.process.linearise import StepComparison, compare_step
 
 _STEP_FLOWS = {85.0: BLUE, 90.0: GREEN, 95.0: PURPLE, 100.0: ORANGE, 105.0: VERMILION, 110.0: BLACK}
 _STEP = 1.0  # l/min
@@ -221,9 +221,8 @@ def unit_step(study: Study, drawing: Drawing, name: str) -> Finding:
 
 
 def _compare(study: Study, step: float) -> StepComparison:
-    return compare_step(
-        study.model, study.operating(FLOW), np.array([FLOW]), np.array([step]), _RUN_MIN, _RUN_PERIOD_MIN
-    )
+    point, flow = study.operating(FLOW).state, np.array([FLOW])
+    return compare_step(study.model, point, flow, np.array([step]), _RUN_MIN, _RUN_PERIOD_MIN)
 
 
 def _steady_change(study: Study, step: float) -> np.ndarray[tuple[int], np.dtype[np.float64]]:

@@ -22,18 +22,27 @@ from numpy.typing import ArrayLike
 
 from reactorwatch.arrays import Array
 from reactorwatch.errors import UnfitRecordError
-from reactorwatch.identification.batch import LeastSquares, unscale
+from reactorwatch.identification.data import Rows, ScaledRecord
+from reactorwatch.identification.least_squares import LeastSquares
+from reactorwatch.identification.linear import unscale
 from reactorwatch.identification.linear_model import LinearModel
-from reactorwatch.identification.scaled_record import ScaledRecord
-from reactorwatch.identification.structure import REPORT_ROWS, Structure, as_columns
+from reactorwatch.identification.structure import Structure, as_columns
 
 ORDER = 3
 """Order of the model that the report finds best."""
+SKIP, EVERY = 99, 6
+"""The report fits every 6th row from the 100th on, with lags of the fast clock."""
 WIDTH = 3.0
 """Width of its limits, in standard deviations."""
 MOST_STEPS = 20
 """Steps after which an iteration that has not settled ends."""
 _SETTLED = 1e-9
+
+
+def report_rows(rows: Rows) -> Rows:
+    """Those of the rows that the report fits."""
+    taken = (rows.position >= SKIP) & ((rows.position - SKIP) % EVERY == 0)
+    return Rows(rows.regressors[taken], rows.outputs[taken], rows.position[taken])
 
 
 def fit_least_squares(
@@ -122,11 +131,11 @@ def chart_output(
 
 def _solve(record: ScaledRecord) -> LinearModel:
     """Least squares of least norm on the report's rows, as a model in the signals' own units."""
-    structure, rows = record.structure, record.rows(REPORT_ROWS)
+    structure, rows = record.structure, report_rows(record.rows())
     regressors = rows.regressors[:, : structure.parameters - int(structure.offset)]
     if not len(regressors):
         raise UnfitRecordError(
-            f"the report's scheme takes every {REPORT_ROWS.every}th row from row {REPORT_ROWS.skip + 1} on, and "
+            f"the report's scheme takes every {EVERY}th row from row {SKIP + 1} on, and "
             f"none of these is complete with the {structure.history} rows before it: {len(record.y)} rows are too few"
         )
     singular = np.linalg.svd(regressors, compute_uv=False)

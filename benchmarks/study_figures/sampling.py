@@ -20,12 +20,12 @@ from benchmarks.study_figures.figure import (
     panels,
     verdict,
 )
+from benchmarks.study_figures.report_scheme import EVERY, SKIP, report_rows
 from benchmarks.study_figures.study import FAST_PERIOD_MIN, IDENTIFICATION_HOLD_MIN, ORDERS, Study, levels, row_times
 from plant_node.scenario import RandomSteps, Scenario, Sines, Square
 from reactorwatch.arrays import Array
 from reactorwatch.errors import InputError
-from reactorwatch.identification.batch import SINGULAR_CONDITION, fit_arx
-from reactorwatch.identification.excitation import (
+from reactorwatch.identification.checks import (
     FASTEST_SAMPLES,
     LARGEST_CONDITION,
     SLOWEST_SAMPLES,
@@ -33,9 +33,9 @@ from reactorwatch.identification.excitation import (
     persistence,
     sampling,
 )
-from reactorwatch.identification.regressor import rows_of
-from reactorwatch.identification.scaled_record import ScaledRecord
-from reactorwatch.identification.structure import ALL_ROWS, REPORT_ROWS, RowChoice, Scaling, Structure
+from reactorwatch.identification.data import Rows, ScaledRecord
+from reactorwatch.identification.least_squares import SINGULAR_CONDITION, least_squares
+from reactorwatch.identification.structure import Structure
 from reactorwatch.records.record import Record
 
 _INPUTS: tuple[tuple[str, Scenario], ...] = (
@@ -112,10 +112,10 @@ def sampling_rate(study: Study, drawing: Drawing) -> Finding:
         for_condition.loglog(periods, conditions[noise], "o-", color=colour, markersize=4, label=name)
         if not noise:
             judged = [sampling(ScaledRecord.of(_STRUCTURE, u[::d], y[::d])) for d in _DECIMATIONS]
-            really = u[:: _CLOCK * REPORT_ROWS.every], y[:: _CLOCK * REPORT_ROWS.every]
+            really = u[:: _CLOCK * EVERY], y[:: _CLOCK * EVERY]
     samples = np.array([check.value for check in judged])
     chosen = {name: report_choice(study.quiet(scenario)) for name, scenario in _DRIVEN_BY.items()}
-    slowed = _condition(*really, ALL_ROWS)
+    slowed = _condition(ScaledRecord.of(_STRUCTURE, *really).rows())
     clock_min = _CLOCK * FAST_PERIOD_MIN
     for_condition.axhline(LARGEST_CONDITION, color=BLACK, linewidth=1, linestyle=":", label="largest that is accepted")
     for (name, (_, condition, *_)), colour in zip(chosen.items(), (GREEN, VERMILION, PURPLE), strict=True):
@@ -131,7 +131,7 @@ def sampling_rate(study: Study, drawing: Drawing) -> Finding:
         )
     for_condition.set_ylim(10, _TOP)
     for_condition.plot(
-        clock_min * REPORT_ROWS.every,
+        clock_min * EVERY,
         slowed,
         "D",
         color=BLACK,
@@ -164,8 +164,8 @@ def sampling_rate(study: Study, drawing: Drawing) -> Finding:
         f"only {conditions[True][0]:.3g}: noise hides the near dependence, it does not cure it. The check, which "
         f"looks at the response instead, accepts periods of {good.min():g} to {good.max():g} min; slower, the "
         f"response is over between two samples (one swing takes {2 * np.pi / abs(pole.imag):.2f} min). Sampled every "
-        f"{clock_min * REPORT_ROWS.every:g} min the condition number is {slowed:.3g}.\n\n"
-        f"The report's choice, every {REPORT_ROWS.every}th row from the {REPORT_ROWS.skip + 1}th on with lags of the "
+        f"{clock_min * EVERY:g} min the condition number is {slowed:.3g}.\n\n"
+        f"The report's choice, every {EVERY}th row from the {SKIP + 1}th on with lags of the "
         f"fast clock, on runs without noise with {clock_min:g} min between rows (the clock of the DaISy record; the "
         "report's own is not known):\n\n"
         "| input | condition number, all rows | the report's rows | what the software says of the report's rows |\n"
@@ -186,15 +186,17 @@ def sampling_rate(study: Study, drawing: Drawing) -> Finding:
 def report_choice(record: Record) -> tuple[float, float, str, bool]:
     """The report's rows of a record."""
     u, y = record.columns["qc"], record.columns[_OUTPUT]
+    all_rows = ScaledRecord.of(_STRUCTURE, u, y).rows()
+    chosen = report_rows(all_rows)
     try:
-        fit_arx(_STRUCTURE, u, y, choice=REPORT_ROWS)
+        least_squares(chosen.regressors, chosen.outputs)
         said = "fits"
     except InputError as refusal:
         said = f"refused: {str(refusal).partition(':')[0]}"
-    rows = np.arange(REPORT_ROWS.skip, u.size, REPORT_ROWS.every)
+    rows = np.arange(SKIP, u.size, EVERY)
     lags = [u[rows - lag] for lag in range(_STRUCTURE.delay, _STRUCTURE.delay + _STRUCTURE.input_lags)]
     blind = any(np.array_equal(one, other) for one, other in combinations(lags, 2))
-    return _condition(u, y, ALL_ROWS), _condition(u, y, REPORT_ROWS), said, blind
+    return _condition(all_rows), _condition(chosen), said, blind
 
 
 def _format_condition(value: float) -> str:
@@ -202,7 +204,5 @@ def _format_condition(value: float) -> str:
     return f"{value:.3g}" if value <= SINGULAR_CONDITION else f"above {SINGULAR_CONDITION:.0e}: singular"
 
 
-def _condition(inputs: Array, outputs: Array, choice: RowChoice) -> float:
-    scaling = Scaling.of(inputs, outputs)
-    u, y = scaling.inputs(inputs[:, None]), scaling.outputs(outputs[:, None])
-    return float(np.linalg.cond(rows_of(_STRUCTURE, u, y, choice=choice).regressors))
+def _condition(rows: Rows) -> float:
+    return float(np.linalg.cond(rows.regressors))

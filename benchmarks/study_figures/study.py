@@ -15,11 +15,11 @@ from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from plant_node.scenario import Scenario
 from reactorwatch.arrays import Array
-from reactorwatch.identification.families import LINEAR_FAMILIES, Model
 from reactorwatch.identification.linear_model import LinearModel
+from reactorwatch.identification.selection import LINEAR_FITS, Model
 from reactorwatch.identification.structure import Structure
-from reactorwatch.process.library.cstr.model import OPERATING_COOLANT_FLOW, cstr
-from reactorwatch.process.library.cstr.operation import NOISE_SD, OPERATION
+from reactorwatch.process.library.cstr import OPERATING_COOLANT_FLOW, cstr
+from reactorwatch.process.library.cstr_operation import NOISE_SD, OPERATION
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.simulate import Simulator
 from reactorwatch.process.steady_state import SteadyState, steady_states
@@ -109,8 +109,8 @@ class Study:
     @cache  # noqa: B019 # as `points`
     def fit(self, family: str, order: int, output: str) -> Model:
         """Fit a model to the first half of the identification record."""
-        (kind,) = (item for item in LINEAR_FAMILIES if item.name == family)
-        return kind.fit(Structure.of_order(order), *(values[: values.size // 2] for values in self.signals(output)))
+        half = (values[: values.size // 2] for values in self.signals(output))
+        return LINEAR_FITS[family](Structure.of_order(order), *half)
 
     @cache  # noqa: B019 # as `points`
     def report_fit(self, family: str, order: int, output: str) -> LinearModel:

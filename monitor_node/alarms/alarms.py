@@ -6,7 +6,7 @@ One point beyond 3 sigma comes by chance every 370 samples: at ten samples a min
 work with that. So an alarm is raised by `raise_count` violating points among the last `window` (on-delay), and cleared
 by `clear_count` ordinary points in a row (off-delay). With a dead band a point near the limit is neither violating nor
 ordinary, so that a value near its limit gives one alarm and not many. The remaining rate of false alarms is
-`spc.m_of_n.false_alarm_rate`.
+`spc.run_length.false_alarm_rates`.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,7 +20,7 @@ from reactorwatch.contract import keys
 from reactorwatch.contract.alarm_states import State
 from reactorwatch.contract.messages_pb2 import Priority, Suspect
 from reactorwatch.spc.charts.base import Judgement
-from reactorwatch.spc.m_of_n import check_rule
+from reactorwatch.spc.run_length import check_rule
 from reactorwatch.stored_state import Memory
 
 PRIORITIES: Mapping[str, Priority] = {

@@ -9,14 +9,12 @@ from monitor_node.config import MonitorConfig
 from reactorwatch.arrays import Array
 from reactorwatch.contract import keys
 from reactorwatch.spc import false_alarm_budget
-from reactorwatch.spc.baseline import Baseline, complete_rows, memory_sds
-from reactorwatch.spc.charts.base import Chart, SignalChart
+from reactorwatch.spc.charts.base import Baseline, Chart, JointChart, SignalChart, complete_rows
 from reactorwatch.spc.charts.catalogue import chart
 from reactorwatch.spc.detection import Detector
-from reactorwatch.spc.joint_chart import JointChart
-from reactorwatch.spc.m_of_n import false_alarm_rates
-from reactorwatch.spc.prewhitening import Prewhitening
-from reactorwatch.spc.training_errors import TrainingErrors
+from reactorwatch.spc.false_alarm_budget import TrainingErrors
+from reactorwatch.spc.prewhitening import Prewhitening, memory_sds
+from reactorwatch.spc.run_length import false_alarm_rates
 from reactorwatch.spc.value_chart import ValueBaseline, ValueChart
 
 ALL = "all"

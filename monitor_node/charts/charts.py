@@ -23,11 +23,10 @@ from reactorwatch.arrays import Array
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Publication
 from reactorwatch.contract.messages_pb2 import ChartPoint
-from reactorwatch.spc.charts.base import Chart, Judgement, Shown, SignalChart
+from reactorwatch.spc.charts.base import Chart, JointChart, Judgement, Shown, SignalChart
 from reactorwatch.spc.charts.catalogue import chart
 from reactorwatch.spc.charts.shewhart import designed_width
 from reactorwatch.spc.compiled_chart import Bank, CompiledChart, SignalMemory
-from reactorwatch.spc.joint_chart import JointChart
 from reactorwatch.spc.prewhitening import Prewhitening
 from reactorwatch.spc.value_chart import ValueChart
 from reactorwatch.stored_state import Memory, read_memory
@@ -56,7 +55,7 @@ class ChartsMemory(Memory):
 
 _Judgements: TypeAlias = list[Judgement | None] | None
 
-_Made: TypeAlias = Bank[CompiledChart] | list[SignalChart] | JointChart | ValueChart
+_Made: TypeAlias = Bank | list[SignalChart] | JointChart | ValueChart
 """Charts of one name: one an output, as a bank where there is a kernel, or one of several signals."""
 
 
@@ -118,7 +117,7 @@ class _Charts(ABC):
 class _Banked(_Charts):
     """Compiled charts, one an output."""
 
-    def __init__(self, bank: Bank[CompiledChart]) -> None:
+    def __init__(self, bank: Bank) -> None:
         super().__init__(bank.memory)
         self._bank = bank
 
@@ -307,7 +306,7 @@ class ChartWatch:
 
         def design_charts(kind: type[Chart]) -> _Made:
             if issubclass(kind, CompiledChart):
-                return Bank([kind.design(baseline.of([index])) for index in range(len(learned))])
+                return Bank.of([kind.design(baseline.of([index])) for index in range(len(learned))])
             if issubclass(kind, SignalChart):
                 return [kind.design(baseline.of([index])) for index in range(len(learned))]
             if issubclass(kind, ValueChart):
@@ -340,8 +339,8 @@ class ChartWatch:
         def resume_charts(kind: type[Chart]) -> _Made:
             data = stored[kind.name]
             if issubclass(kind, CompiledChart):
-                bank = Bank.resume(kind, read_memory(data, SignalMemory))
-                _check_count(bank.numbers.T, outputs)
+                bank = Bank(kind, read_memory(data, SignalMemory))
+                _check_count(bank.memory.numbers.T, outputs)
                 return bank
             if issubclass(kind, SignalChart):
                 return [kind.resume(read_memory(item, kind.memory_type)) for item in _check_count(data, outputs)]

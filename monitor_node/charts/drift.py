@@ -18,9 +18,7 @@ from monitor_node.learn.arx_fit import start_drift_chart
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Publication
 from reactorwatch.errors import InputError
-from reactorwatch.spc.charts.parameters import ParameterT2
-from reactorwatch.spc.parameter_drift import adaptive_weight
-from reactorwatch.spc.run_length.parameters import prepare_limit
+from reactorwatch.spc.charts.parameters import ParameterT2, adaptive_weight, prepare_limit
 
 ROWS = 50
 """Rows from one evaluation to the next. The models remember hundreds of rows, so nothing is missed between."""

@@ -15,8 +15,8 @@ from monitor_node.config import MonitorConfig
 from monitor_node.learn.signal_range import SignalRange
 from reactorwatch.arrays import Array
 from reactorwatch.spc.charts.base import Judgement
+from reactorwatch.spc.false_alarm_budget import TrainingErrors
 from reactorwatch.spc.prewhitening import Prewhitening
-from reactorwatch.spc.training_errors import TrainingErrors
 
 PLANT = "plant"
 """Name in place of a signal for alarms of all signals together."""

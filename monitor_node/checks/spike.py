@@ -12,9 +12,9 @@ from monitor_node.config import MonitorConfig
 from monitor_node.learn.signal_range import SignalRange
 from reactorwatch.arrays import Array
 from reactorwatch.spc.charts.base import Judgement, format_quantity
+from reactorwatch.spc.false_alarm_budget import TrainingErrors, two_sided_tail
 from reactorwatch.spc.prewhitening import Prewhitening
 from reactorwatch.spc.spike import Spikes
-from reactorwatch.spc.training_errors import TrainingErrors, two_sided_tail
 
 
 class SpikeCheck(SignalCheck):

@@ -20,8 +20,8 @@ from monitor_node.checks.stuck import StuckCheck
 from monitor_node.config import MonitorConfig
 from monitor_node.learn.signal_range import SignalRange
 from reactorwatch.arrays import Array
+from reactorwatch.spc.false_alarm_budget import TrainingErrors
 from reactorwatch.spc.prewhitening import Prewhitening
-from reactorwatch.spc.training_errors import TrainingErrors
 from reactorwatch.stored_state import Records, read_memory
 
 CHECKS: tuple[type[SignalCheck], ...] = (SilenceCheck, StuckCheck, SpikeCheck, RangeCheck)

@@ -32,7 +32,7 @@ from monitor_node.config import MonitorConfig
 from monitor_node.ingest.rows import MeasuredRow
 from monitor_node.learn.references import Reference, RowPrediction
 from reactorwatch.arrays import Array
-from reactorwatch.identification.regressor import Rows
+from reactorwatch.identification.data import Rows
 from reactorwatch.identification.rls import RecursiveLeastSquares, RlsMemory
 from reactorwatch.identification.structure import Scaling, Structure
 from reactorwatch.kalman.batch import GATE

@@ -14,13 +14,12 @@ from monitor_node.learn.training_rows import RowArrays
 from reactorwatch.arrays import Array
 from reactorwatch.contract.messages_pb2 import Check, ModelSnapshot, Parameter
 from reactorwatch.errors import InputError
-from reactorwatch.identification.excitation import check_record
+from reactorwatch.identification.checks import ResidualTest, check_record, independence, whiteness
+from reactorwatch.identification.data import Rows, rows_of
 from reactorwatch.identification.identify import WORST_MINUS_LOG10_P
 from reactorwatch.identification.linear_model import standard_deviations
-from reactorwatch.identification.regressor import Rows, rows_of
-from reactorwatch.identification.residual_tests import ResidualTest, independence, whiteness
 from reactorwatch.identification.structure import Structure
-from reactorwatch.spc.parameter_drift import learn
+from reactorwatch.spc.charts.parameters import learn
 
 ROWS_A_PARAMETER = 10
 """Least number of rows per parameter of a fitted model."""

@@ -40,8 +40,8 @@ from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MINUTE_NS
 from reactorwatch.spc import false_alarm_budget
 from reactorwatch.spc.charts.parameters import ParameterT2
+from reactorwatch.spc.false_alarm_budget import TrainingErrors
 from reactorwatch.spc.prewhitening import Prewhitener, Prewhitening
-from reactorwatch.spc.training_errors import TrainingErrors
 from reactorwatch.stored_state import Memory, Records, place_records
 
 

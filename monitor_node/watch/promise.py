@@ -1,7 +1,7 @@
 """Promise of false alarms of one plant: on average, for this plant, and as its training and the watch bear it out.
 
 Limits aim at the configured rate always. On average over trainings they keep it. Of one plant an upper bound at 90 %
-is stated, because its limits were estimated (`reactorwatch.spc.training_errors`). Both take the plant to go on as in
+is stated, because its limits were estimated (`reactorwatch.spc.false_alarm_budget`). Both take the plant to go on as in
 its training. Whether it does is checked twice: the second half of the training is judged by the first
 (`promise_check`), and the alarms that come while the plant is watched are compared with those promised.
 """
@@ -31,8 +31,7 @@ from reactorwatch.contract.codec import Publication
 from reactorwatch.contract.messages_pb2 import Alarm, Promise
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.spc import false_alarm_budget
-from reactorwatch.spc.false_alarm_budget import DAYS, DAYS_MIN
-from reactorwatch.spc.training_errors import CONFIDENCE, QUANTILE
+from reactorwatch.spc.false_alarm_budget import CONFIDENCE, DAYS, DAYS_MIN, QUANTILE
 from reactorwatch.stored_state import Memory, Storable
 
 UNLIKELY = 0.003

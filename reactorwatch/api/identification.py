@@ -11,7 +11,7 @@ from reactorwatch.api.page import write_page
 from reactorwatch.api.records import ProcessLike, process_of
 from reactorwatch.description.find import find_process
 from reactorwatch.errors import InputError, describe_unknown
-from reactorwatch.identification.dataset import Dataset
+from reactorwatch.identification.data import Dataset
 from reactorwatch.identification.identify import HeldOutRun, Identification, ModelForm, identify_and_run
 from reactorwatch.notebook import html
 from reactorwatch.notebook.figures import MEASURED, MODEL, Line, Panel, draw_panels

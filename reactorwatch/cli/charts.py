@@ -24,9 +24,9 @@ def shewhart(
     as_json: Json = False,
 ) -> None:
     """Individual values, with run rules."""
-    from reactorwatch.spc import run_length
+    from reactorwatch.spc.charts.shewhart import shewhart_run_length
 
-    length = run_length.shewhart(shift, limit, _rules(rules), steady_state=steady_state)
+    length = shewhart_run_length(shift, limit, _rules(rules), steady_state=steady_state)
     _print_length(length, as_json, chart="shewhart", rules=list(_rules(rules)), limit=limit, shift=shift)
 
 
@@ -40,9 +40,9 @@ def cusum(
     as_json: Json = False,
 ) -> None:
     """Two-sided cumulative sums."""
-    from reactorwatch.spc import run_length
+    from reactorwatch.spc.charts.cusum import cusum_run_length
 
-    length = run_length.cusum(shift, k, h, headstart, one_sided=one_sided, steady_state=steady_state)
+    length = cusum_run_length(shift, k, h, headstart, one_sided=one_sided, steady_state=steady_state)
     _print_length(length, as_json, chart="cusum", k=k, h=h, headstart=headstart, shift=shift)
 
 
@@ -55,9 +55,9 @@ def ewma(
     as_json: Json = False,
 ) -> None:
     """Exponentially weighted moving average."""
-    from reactorwatch.spc import run_length
+    from reactorwatch.spc.charts.ewma import ewma_run_length
 
-    length = run_length.ewma(shift, weight, limit, exact_limits=exact_limits, steady_state=steady_state)
+    length = ewma_run_length(shift, weight, limit, exact_limits=exact_limits, steady_state=steady_state)
     _print_length(length, as_json, chart="ewma", **{"lambda": weight}, limit=limit, shift=shift)
 
 
@@ -70,9 +70,9 @@ def mewma(
     as_json: Json = False,
 ) -> None:
     """Moving average of several signals."""
-    from reactorwatch.spc import run_length
+    from reactorwatch.spc.charts.mewma import mewma_run_length
 
-    length = run_length.mewma(shift, dimension, weight, limit, steady_state=steady_state)
+    length = mewma_run_length(shift, dimension, weight, limit, steady_state=steady_state)
     _print_length(length, as_json, chart="mewma", dimension=dimension, **{"lambda": weight}, limit=limit, shift=shift)
 
 
@@ -84,10 +84,10 @@ def t2(
     as_json: Json = False,
 ) -> None:
     """Hotelling's T2, known covariance; it has no memory, so its steady state is as any other."""
-    from reactorwatch.spc import run_length
+    from reactorwatch.spc.charts.t2 import t2_run_length
 
     _print_length(
-        run_length.t2(shift, dimension, limit), as_json, chart="t2", dimension=dimension, limit=limit, shift=shift
+        t2_run_length(shift, dimension, limit), as_json, chart="t2", dimension=dimension, limit=limit, shift=shift
     )
 
 
@@ -106,7 +106,7 @@ def list_charts() -> None:
 
 
 def design(
-    chart: Annotated[str, Argument(help="shewhart, cusum, ewma, mewma or t2.")],
+    chart: Annotated[str, Argument(help="shewhart, ewma, cusum, t2 or mewma.")],
     arl0: Annotated[float, Option(help="Samples to a false alarm, on average.")],
     shift: Annotated[float, Option(help="To be detected, in standard deviations.")],
     dimension: Dimension = 2,
@@ -114,9 +114,14 @@ def design(
     as_json: Json = False,
 ) -> None:
     """The chart that detects a shift fastest at a rate of false alarms."""
-    from reactorwatch.spc.run_length.control_limits import design as fastest
+    from reactorwatch.spc.charts.catalogue import CHARTS
+    from reactorwatch.spc.run_length import check_design
 
-    found = fastest(chart, arl0, shift, dimension=dimension, rules=_rules(rules))
+    kinds = {kind.name: kind for kind in CHARTS if "fastest" in vars(kind)}
+    if chart not in kinds:
+        raise InputError(f"chart must be one of {', '.join(kinds)}, got {chart!r}")
+    check_design(arl0, shift, dimension)
+    found = kinds[chart].fastest(arl0, shift, dimension, _rules(rules))
     if as_json:
         print_lines(json_line(found))
         return

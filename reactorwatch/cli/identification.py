@@ -9,7 +9,7 @@ from reactorwatch.description.choice import ProcessChoice
 from reactorwatch.description.find import DEFAULT_PROCESS, find_process
 from reactorwatch.description.process import Process
 from reactorwatch.errors import InputError, describe_unknown
-from reactorwatch.identification.dataset import Dataset
+from reactorwatch.identification.data import Dataset
 from reactorwatch.identification.identify import Coefficients, Identification, ModelForm, identify
 from reactorwatch.identification.selection import Selection, select
 from reactorwatch.records.record import Record

@@ -22,7 +22,7 @@ from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from reactorwatch.contract.codec import encode
 from reactorwatch.diagnosis.diagnose import diagnose
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import cstr
 from reactorwatch.version import version
 from recorder.tools.player import samples_of
 

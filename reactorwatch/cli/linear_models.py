@@ -8,10 +8,9 @@ import numpy as np
 
 from reactorwatch.arrays import Array
 from reactorwatch.errors import InputError
-from reactorwatch.process.linearise import linearise
+from reactorwatch.process.linearise import compare_step, linearise
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.steady_state import SteadyState, steady_states
-from reactorwatch.process.step_response import compare_step
 
 STEP_SHARE = 0.1
 """Default step of an input, as a share of its scale."""
@@ -73,7 +72,7 @@ def _step_errors(model: ProcessModel, point: SteadyState, inputs: Array, steps: 
     for index, name in enumerate(model.input_names):
         step = np.zeros(inputs.size)
         step[index] = steps[name]
-        error = compare_step(model, point, inputs, step).error.tolist()
+        error = compare_step(model, point.state, inputs, step).error.tolist()
         found[name] = dict(zip(model.output_names, error, strict=True))
     return found if len(found) > 1 else next(iter(found.values()))
 

@@ -11,8 +11,7 @@ import msgspec
 from reactorwatch.errors import InputError, describe_exception, describe_unknown, prefix_errors
 from reactorwatch.process import OPERATIONS, own_effects
 from reactorwatch.process.effect import Effect
-from reactorwatch.process.effect_twins import add_generic
-from reactorwatch.process.generic_effects import generic_effects
+from reactorwatch.process.generic import add_generic, generic_effects
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.operation import Operation, WatchDefaults
 from reactorwatch.process.stored_equations import store_equations
@@ -93,7 +92,7 @@ class Process:
         signals: the signals, each name once; at least one of them an output.
         equations: the model, in the units of the equations; None: it is learned from data.
         effects: what can be named as a cause and injected as a fault.
-        controllers: controllers of its inputs, for a simulation (see `reactorwatch.process.controller`).
+        controllers: controllers of its inputs, for a simulation (see `reactorwatch.process.operation`).
         parameters: constants of the equations that are given, by name: value, standard deviation and unit.
         file_format: statements on how to read its files; the rest is guessed for each file.
         operation: levels of its inputs, noise of its sensors and named runs, for a simulation.

@@ -49,7 +49,7 @@ from reactorwatch.diagnosis.search.search import FittedHypothesis, Search, Searc
 from reactorwatch.diagnosis.whiteness import DOUBTFUL, WHITE, minus_log10_p
 from reactorwatch.process import effects_of
 from reactorwatch.process.effect import TIMING, Effect
-from reactorwatch.process.effect_twins import hidden_sources
+from reactorwatch.process.generic import hidden_sources
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.profiles import CONSTANT, FREE_NAME
 from reactorwatch.records.record import MAX_SPANS, Record

@@ -21,8 +21,7 @@ from reactorwatch.diagnosis.parameter_priors import offset_changes
 from reactorwatch.diagnosis.run import Run
 from reactorwatch.diagnosis.search.search import FittedHypothesis
 from reactorwatch.kalman.batch import FilterResult
-from reactorwatch.process.integrate import SimulationError
-from reactorwatch.process.simulate import Simulator
+from reactorwatch.process.simulate import SimulationError, Simulator
 
 EVERY, BLOCK_MIN, FEWEST_BLOCKS = 4, 10.0, 7.5
 """Blocks are shorter in a record with fewer of them; the second held-out block then ends before the record."""

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from reactorwatch.arrays import Array
-from reactorwatch.process.generic_effects import output_scales, reference_point
+from reactorwatch.process.generic import output_scales, reference_point
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.simulate import Simulator
 from reactorwatch.process.steady_state import SteadyState, steady_states

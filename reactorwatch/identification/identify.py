@@ -3,7 +3,8 @@
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Any
+from functools import partial
+from typing import Any, get_args
 
 import msgspec
 import numpy as np
@@ -11,31 +12,25 @@ from msgspec import UNSET, UnsetType
 
 from reactorwatch.arrays import Array
 from reactorwatch.errors import InputError, UnfitRecordError, describe_unknown
-from reactorwatch.identification.batch import SINGULAR_CONDITION, fit_arx, solution_of, unscale
-from reactorwatch.identification.dataset import Dataset
-from reactorwatch.identification.excitation import check_record
-from reactorwatch.identification.free_run import FittedModel, free_run
-from reactorwatch.identification.linear_model import LinearModel, fit_percent
-from reactorwatch.identification.output_error import fit_oe
-from reactorwatch.identification.polynomial_narx import PolynomialModel, fit_narx, name_product
-from reactorwatch.identification.polynomial_oe import fit_noe
-from reactorwatch.identification.prediction_error import fit_armax, fit_box_jenkins
-from reactorwatch.identification.regressor import rows_of
-from reactorwatch.identification.residual_tests import DEFAULT_LAGS, independence, whiteness
+from reactorwatch.identification.checks import DEFAULT_LAGS, check_record, independence, whiteness
+from reactorwatch.identification.data import Dataset, RunPlan, plan_run, rows_of
+from reactorwatch.identification.least_squares import SINGULAR_CONDITION, LeastSquares
+from reactorwatch.identification.linear import fit_linear, unscale
+from reactorwatch.identification.linear_model import Kind, LinearModel, fit_percent, simulate
+from reactorwatch.identification.polynomial import PolynomialModel, fit_narx, fit_noe, name_product
 from reactorwatch.identification.rls import RecursiveLeastSquares
 from reactorwatch.identification.structure import Scaling, Structure
 
+FittedModel = LinearModel | PolynomialModel
+
 MODELS: dict[str, Callable[..., FittedModel]] = {
-    "arx": fit_arx,
-    "oe": fit_oe,
-    "armax": fit_armax,
-    "bj": fit_box_jenkins,
+    **{kind: partial(fit_linear, kind) for kind in get_args(Kind)},
     "narx": fit_narx,
     "noe": fit_noe,
 }
 """Fits by the kind of model."""
 
-WORST_MINUS_LOG10_P = 6.0
+WORST_MINUS_LOG10_P = 6.0  # of a residual test: one in a million true models fails
 
 Coefficients = tuple[float, ...]
 InputCoefficients = Coefficients | dict[str, Coefficients]
@@ -259,6 +254,64 @@ def identify_and_run(
     return found, HeldOutRun(held_out.time, y, predicted, run)
 
 
+def free_run(model: FittedModel, data: Dataset, settle: int = 0) -> Array:
+    """Simulate a model along a data set.
+
+    A simulation that starts from n measured rows carries their noise along. With more rows the initial state can be
+    estimated: for a linear model the simulation is linear in its n initial outputs, and these are fitted to the rows by
+    least squares. A model that is not linear starts from the last rows of these.
+
+    Args:
+        model: the model.
+        data: rows that drive it, and set its state.
+        settle: number of first rows that may set the state and have no simulated value; the model takes as many as its
+            history has at least.
+
+    Returns:
+        Shape (rows,); NaN where there is no simulated value, inf after it has diverged.
+    """
+    history = model.structure.history
+    if settle > history and not isinstance(model, LinearModel):
+        _, later = data.split(settle - history)
+        run = np.full(data.rows, np.nan)
+        run[settle - history :] = model.simulate(*later.arrays)[:, 0]
+    else:
+        run = model.simulate(*data.arrays)[:, 0]
+        if settle > history and isinstance(model, LinearModel):
+            run += _state_correction(model.structure, model.dynamics, data, run, settle)
+    run[:settle] = np.nan
+    return run
+
+
+def _state_correction(structure: Structure, dynamics: Array, data: Dataset, run: Array, settle: int) -> Array:
+    """Change of the run by the initial outputs that fit the settling rows best, shape (rows,)."""
+    lags, correction = structure.output_lags, np.zeros(data.rows)
+    plan = plan_run(structure, *data.arrays)
+    starts = np.flatnonzero(plan.starts)
+    if starts.size == 0 or starts[0] >= settle:
+        return correction
+    start = int(starts[0])
+    ends = np.flatnonzero(~plan.running[start:])
+    end = min(start + int(ends[0]) if ends.size else data.rows, int(starts[1]) if starts.size > 1 else data.rows)
+    alone = np.zeros_like(plan.running)
+    alone[start:end] = True
+    homogeneous = np.zeros_like(dynamics)
+    homogeneous[:lags] = dynamics[:lags]
+    responses = np.zeros((data.rows, lags))
+    for lag in range(1, lags + 1):
+        unit = np.zeros((data.rows, 1))
+        unit[start - lag] = 1.0
+        only_start = RunPlan(np.arange(data.rows) == start, alone)
+        response = simulate(structure, homogeneous, np.zeros_like(data.inputs), unit, only_start)[:, 0]
+        responses[start:end, lag - 1] = response[start:end]
+        responses[start - lag, lag - 1] = 1.0
+    errors = np.where(np.arange(data.rows) < start, 0.0, data.output[:, 0] - run)
+    rows = np.arange(start - lags, min(settle, end))
+    rows = rows[np.isfinite(errors[rows]) & np.isfinite(responses[rows]).all(axis=1)]
+    correction[start:end] = responses[start:end] @ np.linalg.lstsq(responses[rows], errors[rows])[0]
+    return correction
+
+
 def _check_rows(structure: Structure, form: ModelForm, fitted: Dataset, held_out: Dataset, settle: int) -> None:
     of_noise = {"armax": form.order, "bj": 2 * form.order}.get(form.model, 0)
     least = structure.history + structure.parameters + of_noise
@@ -285,7 +338,14 @@ def _fit(structure: Structure, form: ModelForm, data: Dataset) -> FittedModel:
         estimator.update(regressor, float(value))
     if estimator.condition >= SINGULAR_CONDITION:
         raise UnfitRecordError(f"the rows don't determine {structure.parameters} parameters")
-    return unscale("arx", structure, scaling, solution_of(estimator))
+    solution = LeastSquares(
+        estimator.parameters,
+        estimator.unit_covariance,
+        estimator.noise_variance,
+        estimator.condition,
+        estimator.rows,
+    )
+    return unscale("arx", structure, scaling, solution)
 
 
 def _coefficients(model: FittedModel, data: Dataset) -> tuple[dict[str, Any], dict[str, Any]]:

@@ -2,30 +2,26 @@
 
 The covariance form of the textbooks fails in service: without excitation its forgetting divides the covariance by
 `forgetting` at every row until it overflows, and rounding makes it indefinite. Here the information matrix A is kept
-as factors R' D R (below). Three things follow.
+as factors R' D R (below). Two things follow.
 
 *Nothing need be assumed.* D = 0 is a valid start: no prior, no "large P(0)". Without forgetting the result is the QR
 solution of the batch problem, and as accurate. A column that is dependent on those before it keeps the parameter 0
 and an infinite standard deviation until rows resolve it.
 
-*Forgetting costs n multiplications*, D <- forgetting D, and leaves the parameters exactly as they are.
-
-*Forgetting has a floor.* Salgado, Goodwin and Middleton (Int. J. Control 47 (1988) 477) forget only what exceeds a
-floor: A <- forgetting A + (1 - forgetting) floor I. The floor is information about the parameters as they now are,
-so it pulls them nowhere. It is renewed one coordinate a row, in turn (the idea is Gunnarsson's, Proc. 35th IEEE
-Conference on Decision and Control, 1996), by a row e_i with the output theta_i. With f for forgetting, the weight
-floor (1 - f^n) / f^(n-1), and a start at A = floor / f^(n-1) I, a coordinate holds floor / f^(n-1) just after its
-turn and still the floor when its turn comes again. Hence, with P = A^-1 and `covariance_limit` = 1 / floor, whatever
-the data are and for ever,
+*Forgetting costs n multiplications*, D <- forgetting D, and leaves the parameters exactly as they are. It has a floor.
+Salgado, Goodwin and Middleton (Int. J. Control 47 (1988) 477) forget only what exceeds a floor: A <- forgetting A +
+(1 - forgetting) floor I. The floor is information about the parameters as they now are, so it pulls them nowhere. It is
+renewed one coordinate a row, in turn (the idea is Gunnarsson's, Proc. 35th IEEE Conference on Decision and Control,
+1996), by a row e_i with the output theta_i. With f for forgetting, the weight floor (1 - f^n) / f^(n-1), and a start at
+A = floor / f^(n-1) I, a coordinate holds floor / f^(n-1) just after its turn and still the floor when its turn comes
+again. Hence, with P = A^-1 and `covariance_limit` = 1 / floor, whatever the data are and for ever,
 
     0 < every eigenvalue of P <= covariance_limit,
     every eigenvalue of A <= (largest phi' phi) / (1 - f) + 1 / (covariance_limit f^(n-1)),
 
-to rounding for regressors scaled to the order of 1. (Sizes that differ by many powers of ten within a row cost digits
-of the bound, as they do of any matrix, but never finiteness.)
-
-Forgetting so acts only along directions that the data excite. Along the others the covariance rises to its limit and
-remains there, the parameters stay constant, and the first exciting rows identify them again.
+to rounding for regressors scaled to the order of 1.
+Forgetting so acts only along directions that the data excite. Along the others the covariance rises to its limit, the
+parameters stay constant, and the first exciting rows identify them again.
 
 *Innovation variance and standard deviations* allow for the weights. With W = sum of f^age and W2 = sum of f^(2 age),
 white noise of variance s2 gives cov(theta) = s2 P W2/W, and the weighted sum of squares, which grows by
@@ -62,27 +58,18 @@ from reactorwatch.codegen.numba_kernel import jit
 from reactorwatch.errors import InputError
 from reactorwatch.stored_state import Memory
 
-DEFAULT_COVARIANCE_LIMIT = 1e6
-
-LARGEST_VALUE = 1e30
-"""Regressors and outputs at or beyond this are refused."""
+LARGEST_VALUE = 1e30  # regressors and outputs at or beyond this are refused
 
 # Where nothing is known beforehand, a pivot below this share of its column's sum of squares is rounding, not
 # information: a condition beyond 1e13. Where something is, every pivot carries on what is known of those before it.
 RANK_SHARE = 1e-26
-# Nor is one below this, whatever its column; with LARGEST_VALUE it keeps every product finite.
-_LEAST_PIVOT = 1e-60
+_LEAST_PIVOT = 1e-60  # a smaller one is no information, whatever its column; with LARGEST_VALUE all products are finite
 
 # The numbers of an estimator of n parameters: n each of theta, z (the rotated outputs), d (the diagonal), q (the
 # columns' sums of squares) and what z rounds away; then SQUARES to ROWS; then R's n(n-1)/2 entries above the diagonal,
 # by rows, and what they round away.
 SQUARES, WEIGHT, WEIGHT2, TURN, ROWS = range(5)
 SUMS = 5
-
-
-def state_size(n: int) -> int:
-    """Number of numbers of an estimator with n parameters."""
-    return 5 * n + SUMS + n * (n - 1)
 
 
 @jit
@@ -95,17 +82,7 @@ def rotate(
     exact: bool,
     rank_share: float,
 ) -> float:
-    """Bring a row into R, D and z; returns the weight that remains.
-
-    Args:
-        numbers: numbers of the estimator, shape (state_size(n),).
-        row: regressor, shape (n,), which is rotated in place.
-        weight: weight of the row.
-        output: output of the row.
-        first: the regressor is zero before this index.
-        exact: True to compensate the rounding of the sums.
-        rank_share: a pivot that would stay below this share of its column's sum of squares is passed over.
-    """
+    """Bring a row into R, D and z; returns the weight that remains. The row is zero before the index `first`."""
     n = row.size
     fine = n * (n - 1) // 2
     entry = 5 * n + SUMS + first * (n - 1) - first * (first - 1) // 2
@@ -144,26 +121,6 @@ def rotate(
 
 
 @jit
-def solve(numbers: NDArray[np.float64], n: int) -> None:
-    """Set theta to the solution of R theta = z."""
-    entry = 5 * n + SUMS + n * (n - 1) // 2
-    for i in range(n - 1, -1, -1):
-        numbers[i] = numbers[n + i] + numbers[4 * n + i]
-        entry -= n - 1 - i
-        for j in range(i + 1, n):
-            numbers[i] -= numbers[entry + j - i - 1] * numbers[j]
-
-
-@jit
-def is_acceptable(regressor: NDArray[np.float64], output: float) -> bool:
-    """True if every value is a number smaller in magnitude than LARGEST_VALUE."""
-    fine = abs(output) < LARGEST_VALUE
-    for i in range(regressor.size):
-        fine = fine and abs(regressor[i]) < LARGEST_VALUE
-    return fine
-
-
-@jit
 def update_row(
     numbers: NDArray[np.float64],
     work: NDArray[np.float64],
@@ -173,24 +130,16 @@ def update_row(
     renewal: float,
     rank_share: float,
 ) -> tuple[float, float, float, float]:
-    """Predict a row, then forget, rotate, solve, and renew the floor of one coordinate.
-
-    Args:
-        numbers: numbers of the estimator, shape (state_size(n),).
-        work: work space, shape (n,).
-        regressor: shape (n,).
-        output: the measured output.
-        forgetting: weight of a row relative to its successor.
-        renewal: weight of the floor row that one coordinate a row gets, in turn; 0 without forgetting.
-        rank_share: RANK_SHARE where nothing was known at the start, else 0.
+    """Predict a row, then forget, rotate, solve, and renew the floor of one coordinate, a row of the weight `renewal`.
 
     Returns:
-        Prediction and residual before the update, the standard deviation of such a residual and the leverage; four NaN
-        if the row is not acceptable: then nothing changes.
+        The numbers of `RlsUpdate`; four NaN if the row is not acceptable: then nothing changes.
     """
-    if not is_acceptable(regressor, output):
+    n, is_acceptable = regressor.size, abs(output) < LARGEST_VALUE
+    for i in range(n):
+        is_acceptable = is_acceptable and abs(regressor[i]) < LARGEST_VALUE
+    if not is_acceptable:
         return np.nan, np.nan, np.nan, np.nan
-    n = regressor.size
     sums = numbers[5 * n : 5 * n + SUMS]
     prediction = 0.0
     for i in range(n):
@@ -202,7 +151,12 @@ def update_row(
     residual = output - prediction
     # With forgetting, rounding is forgotten too.
     left = rotate(numbers, work, 1.0, output, 0, forgetting == 1.0, rank_share)
-    solve(numbers, n)
+    entry = 5 * n + SUMS + n * (n - 1) // 2
+    for i in range(n - 1, -1, -1):  # theta solves R theta = z
+        numbers[i] = numbers[n + i] + numbers[4 * n + i]
+        entry -= n - 1 - i
+        for j in range(i + 1, n):
+            numbers[i] -= numbers[entry + j - i - 1] * numbers[j]
     squares, weight, weight2 = sums[SQUARES], sums[WEIGHT], sums[WEIGHT2]
     share = weight2 / weight if weight > 0.0 else 1.0
     free = weight - n * share
@@ -228,7 +182,7 @@ class RlsMemory(Memory):
         parameters: number of parameters.
         forgetting: weight of a row relative to its successor.
         covariance_limit: bound on the eigenvalues of P.
-        numbers: shape (state_size(parameters),), laid out as above.
+        numbers: laid out as above.
     """
 
     parameters: int
@@ -260,8 +214,7 @@ class RecursiveLeastSquares:
     Regressors should be of the order of 1 (`structure.Scaling`): `covariance_limit` counts in their units.
 
     >>> rls = RecursiveLeastSquares(2)
-    >>> for k in range(5):
-    ...     innovation = rls.update([k, 1.0], 3.0 * k - 1.0)
+    >>> innovations = [rls.update([k, 1.0], 3.0 * k - 1.0) for k in range(5)]
     >>> rls.parameters
     array([ 3., -1.])
 
@@ -276,6 +229,7 @@ class RecursiveLeastSquares:
 
     Attributes:
         memory: the settings and what was learned: what runs, and what is stored.
+        forgetting: weight of a row relative to its successor.
     """
 
     memory_type = RlsMemory
@@ -284,13 +238,12 @@ class RecursiveLeastSquares:
         if parameters < 1:
             raise InputError(f"parameters must be at least 1, got {parameters}")
         if covariance_limit is None:
-            covariance_limit = math.inf if forgetting == 1.0 else DEFAULT_COVARIANCE_LIMIT
+            covariance_limit = math.inf if forgetting == 1.0 else 1e6
         if not covariance_limit > 1.0 / LARGEST_VALUE:
             raise InputError(f"covariance_limit must be above {1.0 / LARGEST_VALUE}, got {covariance_limit}")
-        numbers = np.zeros(state_size(parameters))
+        numbers = np.zeros(5 * parameters + SUMS + parameters * (parameters - 1))
         self._use(RlsMemory(parameters, float(forgetting), float(covariance_limit), numbers))
-        start = 1.0 / (covariance_limit * forgetting ** (parameters - 1))
-        self._numbers[2 * parameters : 3 * parameters] = start
+        self._diagonal[:] = 1.0 / (covariance_limit * forgetting ** (parameters - 1))
 
     @classmethod
     def resume(cls, memory: RlsMemory) -> Self:
@@ -304,19 +257,15 @@ class RecursiveLeastSquares:
         return estimator
 
     def _use(self, memory: RlsMemory) -> None:
-        size = state_size(memory.parameters)
+        size = 5 * memory.parameters + SUMS + memory.parameters * (memory.parameters - 1)
         if memory.numbers.shape != (size,):
             raise ValueError(f"{memory.parameters} parameters must have {size} numbers, got {memory.numbers.size}")
         self.memory, self._parameters = memory, memory.parameters
         self._covariance_limit = memory.covariance_limit
         self._rank_share = RANK_SHARE if math.isinf(self._covariance_limit) else 0.0
         self._set_forgetting(memory.forgetting)
-        self._numbers, self._work = memory.numbers, np.zeros(memory.parameters)
-
-    @property
-    def forgetting(self) -> float:
-        """Weight of a row relative to its successor."""
-        return self._forgetting
+        n, self._numbers, self._work = memory.parameters, memory.numbers, np.zeros(memory.parameters)
+        self._diagonal, self._sums = self._numbers[2 * n : 3 * n], self._numbers[5 * n : 5 * n + SUMS]
 
     def update(self, regressor: ArrayLike, output: float) -> RlsUpdate:
         """Predict the output, then learn from it.
@@ -332,10 +281,12 @@ class RecursiveLeastSquares:
         if row.ndim != 1 or row.size != self._parameters:
             raise ValueError(f"regressor must have shape ({self._parameters},), got {row.shape}")
         result = update_row(
-            self._numbers, self._work, row, float(output), self._forgetting, self._renewal, self._rank_share
+            self._numbers, self._work, row, float(output), self.forgetting, self._renewal, self._rank_share
         )
         if result[0] != result[0]:
-            raise ValueError(_describe_invalid(row, output))
+            values = {**{f"regressor[{i}]": value for i, value in enumerate(row)}, "output": output}
+            name, value = next((name, value) for name, value in values.items() if not abs(value) < LARGEST_VALUE)
+            raise ValueError(f"{name} must be a finite number below {LARGEST_VALUE:g} in size, got {value}")
         return RlsUpdate(*result)
 
     def predict(self, regressor: ArrayLike) -> float:
@@ -343,10 +294,7 @@ class RecursiveLeastSquares:
         return float(np.dot(np.asarray(regressor, dtype=np.float64), self._numbers[: self._parameters]))
 
     def set_parameters(self, parameters: ArrayLike) -> None:
-        """Set the parameters and keep their uncertainty.
-
-        Args:
-            parameters: shape (n,).
+        """Set the parameters, shape (n,), and keep their uncertainty.
 
         Raises:
             ValueError: a wrong shape, or a value that is not finite.
@@ -360,18 +308,14 @@ class RecursiveLeastSquares:
         self._numbers[4 * n : 5 * n] = 0.0
 
     def raise_information(self, factor: float) -> None:
-        """Count the rows so far as more, so that rows to come change the parameters less.
-
-        Args:
-            factor: number of rows for one, at least 1.
+        """Count each of the rows so far as `factor` rows, so that rows to come change the parameters less.
 
         Raises:
             ValueError: the factor is below 1.
         """
         if not 1.0 <= factor < math.inf:
             raise ValueError(f"factor must be a number from 1 on, got {factor}")
-        n = self._parameters
-        self._numbers[2 * n : 3 * n] *= factor
+        self._diagonal *= factor
 
     def raise_forgetting(self, forgetting: float) -> None:
         """Raise the forgetting factor from here on, for a recursion that starts with poor parameters.
@@ -379,8 +323,8 @@ class RecursiveLeastSquares:
         Raises:
             ValueError: a value below the present one, for which the covariance's bound would not hold, or above 1.
         """
-        if forgetting < self._forgetting:
-            raise ValueError(f"forgetting can only rise, from {self._forgetting}, got {forgetting}")
+        if forgetting < self.forgetting:
+            raise ValueError(f"forgetting can only rise, from {self.forgetting}, got {forgetting}")
         self._set_forgetting(forgetting)
 
     @property
@@ -391,14 +335,14 @@ class RecursiveLeastSquares:
     @property
     def rows(self) -> int:
         """Number of rows learned from."""
-        return int(self._sums()[ROWS])
+        return int(self._sums[ROWS])
 
     @property
     def covariance(self) -> NDArray[np.float64]:
         """P, shape (n, n): the inverse of the information matrix, in units of the noise variance."""
         inverse = np.linalg.inv(self._factor())
         with np.errstate(divide="ignore", invalid="ignore"):
-            spread = np.where(inverse != 0.0, inverse / np.sqrt(self._diagonal()), 0.0)
+            spread = np.where(inverse != 0.0, inverse / np.sqrt(self._diagonal), 0.0)
         if np.all(np.isfinite(spread)):
             return np.asarray(spread @ spread.T)
         # Along a direction without information two infinities of opposite sign have no sum: only variances are defined.
@@ -417,7 +361,7 @@ class RecursiveLeastSquares:
     @property
     def noise_variance(self) -> float:
         """Variance of the residuals; inf until there are more rows than parameters."""
-        sums = self._sums()
+        sums = self._sums
         free = sums[WEIGHT] - self._parameters * self._weight_share()
         return float(sums[SQUARES] / free) if free > 0.0 else math.inf
 
@@ -429,15 +373,9 @@ class RecursiveLeastSquares:
         return np.where(known, covariance, math.nan) * (variance if math.isfinite(variance) else 1.0)
 
     @property
-    def standard_deviations(self) -> NDArray[np.float64]:
-        """Standard deviations of the parameters, shape (n,); inf where unknown or with too few rows."""
-        variances = np.diag(self.parameter_covariance)
-        return np.sqrt(np.where(np.isnan(variances), math.inf, variances))
-
-    @property
     def condition(self) -> float:
         """Condition number of the regressors in memory; inf if they don't determine the parameters."""
-        values = np.linalg.svd(np.sqrt(self._diagonal())[:, None] * self._factor(), compute_uv=False)
+        values = np.linalg.svd(np.sqrt(self._diagonal)[:, None] * self._factor(), compute_uv=False)
         return float(values[0] / values[-1]) if values[-1] > 0.0 else math.inf
 
     def _set_forgetting(self, forgetting: float) -> None:
@@ -448,29 +386,15 @@ class RecursiveLeastSquares:
                 f"covariance_limit must be below {LARGEST_VALUE} when forgetting < 1, got {self._covariance_limit}"
             )
         n, f = self._parameters, float(forgetting)
-        self._forgetting = self.memory.forgetting = f
+        self.forgetting = self.memory.forgetting = f
         self._renewal = (1.0 - f**n) / (self._covariance_limit * f ** (n - 1))
 
     def _factor(self) -> NDArray[np.float64]:
         n = self._parameters
         factor = np.eye(n)
-        factor[np.triu_indices(n, 1)] = self._numbers[5 * n + 5 : 5 * n + 5 + n * (n - 1) // 2]
+        factor[np.triu_indices(n, 1)] = self._numbers[5 * n + SUMS : 5 * n + SUMS + n * (n - 1) // 2]
         return factor
 
-    def _diagonal(self) -> NDArray[np.float64]:
-        return np.asarray(self._numbers[2 * self._parameters : 3 * self._parameters])
-
-    def _sums(self) -> NDArray[np.float64]:
-        return np.asarray(self._numbers[5 * self._parameters : 5 * self._parameters + 5])
-
     def _weight_share(self) -> float:
-        sums = self._sums()
+        sums = self._sums
         return float(sums[WEIGHT2] / sums[WEIGHT]) if sums[WEIGHT] > 0.0 else 1.0
-
-
-def _describe_invalid(regressor: NDArray[np.float64], output: float) -> str:
-    """Message for an invalid row."""
-    for i, value in enumerate(regressor):
-        if not abs(value) < LARGEST_VALUE:
-            return f"regressor[{i}] must be a finite number below {LARGEST_VALUE:g} in size, got {value}"
-    return f"output must be a finite number below {LARGEST_VALUE:g} in size, got {output}"

@@ -11,8 +11,10 @@ significant.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from typing import Protocol
 
 import msgspec
 import numpy as np
@@ -20,17 +22,36 @@ from numpy.typing import ArrayLike
 
 from reactorwatch.arrays import Array
 from reactorwatch.errors import InputError, UnfitRecordError
-from reactorwatch.identification.families import LINEAR_FAMILIES, Family, Model
+from reactorwatch.identification.linear import fit_linear
 from reactorwatch.identification.linear_model import fit_percent
 from reactorwatch.identification.structure import Structure, as_columns
 
-EQUAL_PERCENT = 0.5
+EQUAL_PERCENT = 0.5  # difference of fits that counts as none
+LEAST_PERCENT = 20.0  # fit on the held-out half: with less no model is recommended (the mean alone has 0 %)
 
-LEAST_PERCENT = 20.0
-"""Least fit of a simulation on the held-out half; with less no model is recommended (the mean alone has 0 %)."""
 
-UNSEEN_SHARE, BEYOND_SHARE = 0.05, 0.1
-"""Share of the held-out inputs, and of the fitted half's range that they must exceed, for an unseen range."""
+class Model(Protocol):
+    """A fitted model. Signals are arrays of shape (rows,) or (rows, signals), NaN where nothing was measured."""
+
+    @property
+    def parameter_count(self) -> int:
+        """Number of parameters."""
+
+    def predict(self, inputs: ArrayLike, outputs: ArrayLike, time: ArrayLike | None = None) -> Array:
+        """One-step-ahead prediction, shape (rows, outputs); NaN where the rows before are incomplete."""
+
+    def simulate(self, inputs: ArrayLike, outputs: ArrayLike, time: ArrayLike | None = None) -> Array:
+        """Simulation, shape (rows, outputs); NaN in the rows that it starts from."""
+
+    def residuals(self, inputs: ArrayLike, outputs: ArrayLike, time: ArrayLike | None = None) -> Array:
+        """Measured minus predicted or simulated, as in the fit, shape (rows, outputs)."""
+
+
+Fit = Callable[..., Model]
+"""Fit of a model to a structure, inputs, outputs and time; raises InputError if they do not determine the model."""
+
+LINEAR_FITS: Mapping[str, Fit] = {"arx": partial(fit_linear, "arx"), "oe": partial(fit_linear, "oe")}
+"""Fits by the name of the family."""
 
 
 class Candidate(msgspec.Struct, frozen=True):
@@ -96,7 +117,7 @@ def select(
     inputs: ArrayLike,
     outputs: ArrayLike,
     time: ArrayLike | None = None,
-    families: Sequence[Family] = LINEAR_FAMILIES,
+    fits: Mapping[str, Fit] = LINEAR_FITS,
     orders: Sequence[int] = (1, 2, 3),
     delay: int = 1,
 ) -> Selection:
@@ -106,7 +127,7 @@ def select(
         inputs: shape (rows,) or (rows, inputs), NaN where nothing was measured.
         outputs: shape (rows,) or (rows, 1), NaN where nothing was measured.
         time: shape (rows,); None: gaps are not detected.
-        families: families to compare.
+        fits: fits to compare, by the name of the family.
         orders: orders to compare.
         delay: delay of the input, in samples.
 
@@ -120,17 +141,17 @@ def select(
     half = len(y) // 2
     fitted: list[tuple[Candidate, Model]] = []
     candidates: list[Candidate] = []
-    for family in families:
+    for family, fit in fits.items():
         for order in orders:
             structure = Structure.of_order(order, delay, u.shape[1])
             try:
-                model = family.fit(structure, u[:half], y[:half], t[:half])
+                model = fit(structure, u[:half], y[:half], t[:half])
             except InputError as refusal:
-                candidates.append(Candidate(family.name, order, refusal=str(refusal)))
+                candidates.append(Candidate(family, order, refusal=str(refusal)))
                 continue
             held_out = u[half:], y[half:], t[half:]
             candidate = Candidate(
-                family.name,
+                family,
                 order,
                 model.parameter_count,
                 fit_percent(y[half:, 0], model.predict(*held_out)[:, 0]),
@@ -149,12 +170,12 @@ def select(
     selection = Selection(tuple(candidates), chosen, model, _reason(chosen, best, candidates))
     if selection.fits:
         return selection
-    family = next(family for family in families if family.name == chosen.family)
     structure = Structure.of_order(chosen.order, delay, u.shape[1])
     return replace(
         selection,
         reason=f"no model fits: {describe(best)} runs best on the held-out half, with "
-        f"{best.free_run_percent:.1f} % where the mean alone has 0 %; {_why_none_fits(family, structure, u, y, t)}",
+        f"{best.free_run_percent:.1f} % where the mean alone has 0 %; "
+        f"{_why_none_fits(fits[chosen.family], structure, u, y, t)}",
     )
 
 
@@ -178,14 +199,14 @@ def bic(residuals: ArrayLike, parameters: int) -> float:
     return values.size * math.log(squares / values.size) + parameters * math.log(values.size)
 
 
-def _why_none_fits(family: Family, structure: Structure, u: Array, y: Array, t: Array) -> str:
+def _why_none_fits(fit: Fit, structure: Structure, u: Array, y: Array, t: Array) -> str:
     """Difference between the halves of a record that explains why a model of the first does not simulate the second."""
     half = len(y) // 2
     before, after = u[:half][np.isfinite(u[:half]).all(axis=1)], u[half:][np.isfinite(u[half:]).all(axis=1)]
-    margin = BEYOND_SHARE * np.ptp(before, axis=0)
+    margin = 0.1 * np.ptp(before, axis=0)
     lowest, highest = before.min(axis=0) - margin, before.max(axis=0) + margin
     unseen = float(np.mean(np.any((after < lowest) | (after > highest), axis=1)))
-    if unseen > UNSEEN_SHARE:
+    if unseen > 0.05:
         return (
             f"{100 * unseen:.0f} % of the second half's inputs are out of the range of the first, which no model has "
             "seen: record a first half that moves as widely"
@@ -195,7 +216,7 @@ def _why_none_fits(family: Family, structure: Structure, u: Array, y: Array, t: 
         f"the output's mean went from {mean:.4g} to {later:.4g}, by {abs(later - mean) / max(spread, 1e-300):.1f} sd"
     )
     try:
-        own = family.fit(structure, u[half:], y[half:], t[half:]).simulate(u[half:], y[half:], t[half:])
+        own = fit(structure, u[half:], y[half:], t[half:]).simulate(u[half:], y[half:], t[half:])
         percent = fit_percent(y[half:, 0], own[:, 0])
     except InputError:
         percent = -math.inf

@@ -1,4 +1,4 @@
-"""Structure of a linear model: orders, delay, scaling, and choice of rows."""
+"""Structure of a linear model: orders, delay and scaling."""
 
 from typing import Self
 
@@ -96,36 +96,6 @@ _TITLES = {
 }
 
 
-class RowChoice(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Choice of the rows of a record that are fitted; lags are counted in samples of the record.
-
-    Attributes:
-        skip: number of rows skipped at the start.
-        every: decimation of the others.
-
-    Raises:
-        InputError: a negative skip, or every below 1.
-    """
-
-    skip: int = 0
-    every: int = 1
-
-    def __post_init__(self) -> None:
-        if self.skip < 0:
-            raise InputError(f"skip must be at least 0, got {self.skip}")
-        if self.every < 1:
-            raise InputError(f"every must be at least 1, got {self.every}")
-
-    def takes(self, row: NDArray[np.intp]) -> NDArray[np.bool_]:
-        """Flags of the rows, by their index from 0, that are fitted."""
-        return np.asarray((row >= self.skip) & ((row - self.skip) % self.every == 0))
-
-
-ALL_ROWS = RowChoice()
-REPORT_ROWS = RowChoice(skip=99, every=6)
-"""The choice of the report this project starts from: from the 100th row on every 6th."""
-
-
 class Scaling(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Scaling of signals, (value - centre) / spread, and of parameters.
 
@@ -186,12 +156,12 @@ class Scaling(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         )
 
     def inputs(self, values: ArrayLike) -> NDArray[np.float64]:
-        """Scale inputs along the last axis."""
-        return (np.asarray(values, dtype=np.float64) - self.input_centres) / self.input_spreads
+        """Scale inputs along the last axis; contiguous, for kernels."""
+        return np.ascontiguousarray((np.asarray(values, dtype=np.float64) - self.input_centres) / self.input_spreads)
 
     def outputs(self, values: ArrayLike) -> NDArray[np.float64]:
-        """Scale outputs along the last axis."""
-        return (np.asarray(values, dtype=np.float64) - self.output_centres) / self.output_spreads
+        """Scale outputs along the last axis; contiguous, for kernels."""
+        return np.ascontiguousarray((np.asarray(values, dtype=np.float64) - self.output_centres) / self.output_spreads)
 
     def unscaling(self, structure: Structure) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Transform M p + m of parameters for scaled signals to those for the signals' own units.
@@ -228,19 +198,6 @@ class Scaling(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         shift = np.zeros(structure.parameters)
         shift[-1] = centre
         return matrix, shift
-
-    def scale_parameters(self, structure: Structure, parameters: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Transform parameters for the signals' own units to those for scaled signals, the inverse of `unscaling`.
-
-        Args:
-            structure: structure of the model.
-            parameters: shape (parameters,).
-
-        Raises:
-            InputError: a model without offset whose signals were centred.
-        """
-        matrix, shift = self.unscaling(structure)
-        return np.asarray(np.linalg.solve(matrix, parameters - shift))
 
 
 def as_columns(values: ArrayLike, name: str, count: int | None = None) -> NDArray[np.float64]:

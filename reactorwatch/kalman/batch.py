@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.compiled_function import LANES, CompiledFunction
-from reactorwatch.process.integrate import LONGEST_STEP_MIN
+from reactorwatch.process.simulate import LONGEST_STEP_MIN
 
 GATE = 6.0  # standard deviations beyond which a measurement is an outlier: once in 500 million normal values
 

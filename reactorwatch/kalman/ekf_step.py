@@ -19,9 +19,8 @@ import numpy as np
 
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.compiled_function import CompiledFunction
-from reactorwatch.process.effect_states import reset_function
-from reactorwatch.process.integrate import state_time_step, symbolic_step
 from reactorwatch.process.model import MODEL_CACHE_SIZE, ProcessModel
+from reactorwatch.process.simulate import reset_function, state_time_step, symbolic_step
 
 LEAST_PROCESS_SD = 1e-6  # in scales of the state; without any process noise its covariance would underflow
 

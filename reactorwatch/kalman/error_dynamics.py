@@ -25,10 +25,8 @@ from reactorwatch.codegen.compiled_function import LANES, CompiledFunction
 from reactorwatch.codegen.numba_kernel import jit
 from reactorwatch.kalman.batch import LONGEST_ROW_MIN, InputUncertainty
 from reactorwatch.kalman.ekf_step import NoiseLevels, transition
-from reactorwatch.process.integrate import LONGEST_STEP_MIN
 from reactorwatch.process.model import ProcessModel
-
-_LEAST_PIVOT = 1e-12
+from reactorwatch.process.simulate import LONGEST_STEP_MIN
 
 
 @dataclass(frozen=True, eq=False)
@@ -317,7 +315,7 @@ def _normalize(
                 value = S[i, j]
                 for m in range(j):
                     value -= L[i, m] * L[j, m]
-                L[i, j] = np.sqrt(max(value, _LEAST_PIVOT * abs(S[i, i]))) if i == j else value / L[j, j]
+                L[i, j] = np.sqrt(max(value, 1e-12 * abs(S[i, i]))) if i == j else value / L[j, j]
         for j in range(n_y):  # column by column of the inverse; 0 where nothing was measured
             for i in range(j, n_y):
                 value = 1.0 if i == j else 0.0

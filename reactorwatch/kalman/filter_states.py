@@ -35,24 +35,16 @@ from reactorwatch.codegen.array_function import ArrayFunction
 from reactorwatch.kalman.ekf_step import output_function
 from reactorwatch.process import effects_of, named_effects
 from reactorwatch.process.effect import TIMING, Effect
-from reactorwatch.process.effect_states import reset_function, rest_function, with_derivatives
-from reactorwatch.process.input_effects import InputLag
 from reactorwatch.process.model import MODEL_CACHE_SIZE, Parameter, ProcessModel, parameter, variable
+from reactorwatch.process.signal_effects import InputLag
+from reactorwatch.process.simulate import reset_function, rest_function, with_derivatives
 from reactorwatch.process.steady_state import SteadyState, SteadyStates
-
-START_SD = 3.0  # of a state that no sensor shows, in its scales
-START_SDS = 10.0  # of a measured state, in standard deviations of the sensor: the value may be an outlier
-MAX_ITERATIONS = 5  # Newton's method doubles its digits in each
 
 CONSTANT, WANDER, NOISE = "constant", "wander", "noise"
 """Kinds of additional states: `constant feed_temperature`, `wander T`, `noise T`."""
 
 MOST_CONSTANTS = 6  # of effects without states; the lags of the inputs come on top
 LEAST_RATE = 0.04  # rms rate that an effect must add to those selected before, in scales of the states a minute
-WANDER_MIN = 200.0  # time constant of a disturbance: its variance stays finite where nothing is measured
-LONGEST_NOISE_MIN = 60.0  # a longer time constant is a drift
-_LAG_SHARE, _LEAST_LAG_SHARE = 0.3, 0.02  # of the typical size: at 0 a lag has no derivative
-_POINTS, _SEED = 24, 7  # at which effects are compared
 
 
 class InitialState:
@@ -77,7 +69,7 @@ class InitialState:
         self._measured_states = [(i, outputs.index(name)) for i, name in enumerate(core.state_names) if name in outputs]
         self._point: tuple[object, ...] = ()
         self._steady: list[SteadyState] = []
-        self._wide = np.diag(np.square([START_SD * state.scale for state in core.states]))
+        self._wide = np.diag(np.square([3.0 * state.scale for state in core.states]))  # of what no sensor shows
         self._rest_sd = np.array([state.scale * (state.name in model.at_rest) for state in model.states])
         self._complete, self._reset = (ArrayFunction(item) for item in _memory_functions(model))
 
@@ -111,11 +103,12 @@ class InitialState:
             distances = [float(np.nansum(((point.outputs - y) / measurement_sd) ** 2)) for point in points]
             x = points[int(np.argmin(distances))].state if points else x
         noise, wide = np.square(measurement_sd), self._wide
-        for _ in range(MAX_ITERATIONS):
+        for _ in range(5):  # Newton's method doubles its digits in each
             before, x = x, self._correct.call(x, u, p, time_min, y, noise, wide)[0][0]
             if np.array_equal(before, x):
                 break
-        P = self._correct.call(x, u, p, time_min, y, START_SDS**2 * noise, wide)[1]
+        # Ten standard deviations of the sensor: the value may be an outlier.
+        P = self._correct.call(x, u, p, time_min, y, 100.0 * noise, wide)[1]
         after, J = self._complete.call(x, u, p, time_min)
         return self.reset(after[0], J.T @ P @ J + np.diag(np.square(self._rest_sd)), u, p, time_min)
 
@@ -218,7 +211,7 @@ def _add_constant(model: ProcessModel, effect: Effect) -> ProcessModel:
     prefix, is_lag = effect.prefix(model), isinstance(effect, InputLag)
     lower, begin = effect.lower, effect.neutral
     if is_lag:
-        lower, begin = _LEAST_LAG_SHARE * effect.typical, _LAG_SHARE * effect.typical
+        lower, begin = 0.02 * effect.typical, 0.3 * effect.typical  # at 0 a lag has no derivative
     bounds = (lower, effect.upper)
     state = variable(f"{prefix}.constant", effect.unit, bounds, effect.typical, f"size of: {effect.label}")
     start = parameter(f"{prefix}.start", begin, effect.unit, bounds, f"expected size of: {effect.label}")
@@ -240,7 +233,8 @@ def _add_wander(model: ProcessModel, name: str) -> ProcessModel:
     balance = model.states[model.state_index(name)]
     reach = 20.0 * balance.scale
     state = variable(f"{name}.wander", f"{balance.unit}/min", (-reach, reach), 0.1 * balance.scale, "disturbance")
-    return model.add_rate(name, state.symbol).with_state(state, -state.symbol / WANDER_MIN, ca.SX(0.0))
+    # With a time constant of 200 min its variance stays finite where nothing is measured.
+    return model.add_rate(name, state.symbol).with_state(state, -state.symbol / 200.0, ca.SX(0.0))
 
 
 def _add_noise(model: ProcessModel, name: str) -> ProcessModel:
@@ -249,7 +243,7 @@ def _add_noise(model: ProcessModel, name: str) -> ProcessModel:
     scale = model.states[model.state_index(name)].scale if name in model.state_names else 1.0
     reach = 100.0 * scale
     state = variable(f"{name}.memory", output.unit, (-reach, reach), 0.1 * scale, "coloured noise")
-    time = parameter(f"{name}.memory_min", 1.0, "min", (0.03, LONGEST_NOISE_MIN), "time constant of the noise")
+    time = parameter(f"{name}.memory_min", 1.0, "min", (0.03, 60.0), "time constant of the noise")
     model = model.with_state(state, -state.symbol / time.symbol, ca.SX(0.0))
     shown = model.with_output(replace(output, expression=output.expression + state.symbol))
     return replace(shown, parameters=(*shown.parameters, time))
@@ -313,8 +307,8 @@ def _slope_functions(model: ProcessModel) -> tuple[tuple[Effect, Array, ca.Funct
 def _rates(model: ProcessModel, effect: Effect, slopes: ArrayFunction, p: Array, x: Array, u: Array) -> Array:
     """Rates in scales a minute that an effect of typical size adds, shape (points * n_x,)."""
     scales, reach = np.array([item.scale for item in model.states]), np.array([item.scale for item in model.inputs])
-    rng, points = np.random.default_rng(_SEED), []
-    for _ in range(_POINTS):
+    rng, points = np.random.default_rng(7), []
+    for _ in range(24):
         at, inputs = x + scales * rng.uniform(-1.0, 1.0, x.size), u + reach * rng.uniform(-1.0, 1.0, u.size)
         points.append(slopes.call(at, inputs, p, 0.0, 0.0, effect.neutral))
     of_rhs, of_y, F, H = (np.stack(items).transpose(0, 2, 1).copy() for items in zip(*points, strict=True))

@@ -39,18 +39,12 @@ from reactorwatch.process.model import ProcessModel
 INITIAL_SHARES = (0.3, 0.03, 0.003)
 """Initial process noise, in scales of the state per square root of a minute; the noisiest converges best."""
 
-LEAST_RELATIVE_SD = 1e-9  # of a sensor, of its largest value: the logarithm of zero is undefined
 NO_NOISE, NEGLIGIBLE_NOISE = 1e-5, 3e-4  # in scales: as good as none, and one that is but from which steps can start
 CLIP = 4.0  # standard deviations beyond which the loss of a value is constant
 FIRST_ROWS = 300  # that the first steps of the search use
-MAX_STEPS, MAX_CUTS = 8, 4
 LONGEST_STEP = 1.2  # of a logarithm: sizes change by at most a factor of 3.3
 DIFFERENCE = 0.01  # of a logarithm, for derivatives
 CONVERGED_GAIN = 0.2  # of log likelihood: less ends the search
-LEAST_PREDICTED_GAIN = 0.02  # of log likelihood: a step with less is not tried
-LEAST_GAIN = 2.0  # of log likelihood: a noise with less is removed, as by Akaike's criterion
-BURN_IN = 20  # rows at the start in which the filter converges
-_WHITE_SHARE, _DRIVING_SHARES = 0.3, (2.0, 6.0, 20.0)  # of the noise by third differences, which see little of it
 _MEDIAN_THIRD_DIFFERENCE = 0.6745 * sqrt(20.0)  # their median size, for white noise of unit variance
 _CUT_MEAN_SQUARE = erf(CLIP / sqrt(2)) - CLIP * sqrt(2 / pi) * exp(-(CLIP**2) / 2)  # of w where |w| < CLIP, else 0
 
@@ -95,8 +89,8 @@ def fit_noise(
     Args:
         model: model of the plant.
         record: the record, at increasing times; measurements that are missing or to be ignored are NaN.
-        smallest_sd: lower bounds of the sensors' noise, one an output, in its unit; at least `LEAST_RELATIVE_SD` of the
-            largest value.
+        smallest_sd: lower bounds of the sensors' noise, one an output, in its unit; at least 1e-9 of the
+            largest value: the logarithm of zero is undefined.
         learned: names of the parameters; the search starts at their values.
         first_sd: initial process noise by name of a state, where it differs from the noise that moves all states alike.
         nearby: further starts of the search, at most three, used where they are likelier than the first rows' result.
@@ -125,8 +119,9 @@ def noise_starts(
     by_name = dict(zip(model.output_names, sds.tolist(), strict=True))
     names = widen_model(model, added).state_names
     driving = np.array([by_name.get(name.removesuffix(".memory"), 0.0) * name.endswith(".memory") for name in names])
-    sensors = tuple(_WHITE_SHARE * sd if name in coloured else sd for name, sd in by_name.items())
-    return [NoiseLevels(sensors, tuple((share * driving).tolist())) for share in _DRIVING_SHARES]
+    sensors = tuple(0.3 * sd if name in coloured else sd for name, sd in by_name.items())
+    # Third differences see little of coloured noise.
+    return [NoiseLevels(sensors, tuple((share * driving).tolist())) for share in (2.0, 6.0, 20.0)]
 
 
 class _NoiseSearch:
@@ -150,7 +145,7 @@ class _NoiseSearch:
         self._first_sd = np.array([first_sd.get(name, 0.0) for name in names])
         self._learned = [model.parameter(name) for name in learned]
         largest = np.max(np.abs(np.nan_to_num(measured)), axis=0)
-        smallest_sd = np.maximum(smallest_sd, LEAST_RELATIVE_SD * np.where(largest > 0.0, largest, 1.0))
+        smallest_sd = np.maximum(smallest_sd, 1e-9 * np.where(largest > 0.0, largest, 1.0))
         limits = np.log([[item.lower, item.upper] for item in self._learned]).reshape(-1, 2).T
         self._lowest = np.concatenate([np.log(smallest_sd), np.log(NO_NOISE * self._scales), limits[0]])
         self._highest = np.concatenate([np.full(self._of_states.stop, inf), limits[1]])
@@ -174,7 +169,7 @@ class _NoiseSearch:
             theta = best.theta.copy()
             theta[index] = self._lowest[index]
             (without,) = self._evaluate([theta])
-            if without.loss < best.loss + LEAST_GAIN:
+            if without.loss < best.loss + 2.0:  # as by Akaike's criterion
                 best = without
         if best is not climbed:  # the sensors' noise now has to account for more
             best, _ = self._step(best, range(self._n_y))
@@ -212,7 +207,7 @@ class _NoiseSearch:
 
     def _climb(self, best: _Trial) -> _Trial:
         """Take scoring steps up to convergence."""
-        for _ in range(MAX_STEPS):
+        for _ in range(8):
             before = best.loss
             best, predicted = self._step(best, range(best.theta.size))
             gain = before - best.loss
@@ -254,9 +249,9 @@ class _NoiseSearch:
         longest = float(np.max(np.abs(step)))
         full = longest <= LONGEST_STEP
         step *= min(1.0, LONGEST_STEP / max(longest, LONGEST_STEP))
-        for _ in range(MAX_CUTS):
+        for _ in range(4):
             predicted = -float(step[chosen] @ (gradient + 0.5 * information @ step[chosen]))
-            if predicted < LEAST_PREDICTED_GAIN:
+            if predicted < 0.02:
                 break
             (trial,) = self._evaluate([np.clip(best.theta + step, self._lowest, self._highest)])
             if trial.loss < best.loss:
@@ -295,7 +290,7 @@ class _NoiseSearch:
         return [self._trial(theta, run) for theta, run in zip(thetas, self._run_filters(thetas), strict=True)]
 
     def _trial(self, theta: Array, run: FilterResult) -> _Trial:
-        w, sd = run.normalized[BURN_IN:], run.conditional_sd[BURN_IN:]
+        w, sd = run.normalized[20:], run.conditional_sd[20:]  # the filter has converged
         known = np.isfinite(w)
         w, d = np.where(known, w, 0.0), np.log(np.where(known, sd, 1.0))
         loss = float(np.sum(d) + 0.5 * np.sum(np.minimum(w**2, CLIP**2)) / _CUT_MEAN_SQUARE)

@@ -4,38 +4,29 @@ from collections.abc import Mapping
 from typing import cast
 
 from reactorwatch.process.effect import Effect
-from reactorwatch.process.generic_effects import generic_effects
-from reactorwatch.process.library.cascaded_tanks.effects import TANK_EFFECTS
-from reactorwatch.process.library.cascaded_tanks.model import tanks
-from reactorwatch.process.library.cascaded_tanks.operation import OPERATION as TANK_OPERATION
-from reactorwatch.process.library.cstr.effects import EFFECTS
-from reactorwatch.process.library.cstr.locations import LOCATIONS as CSTR_LOCATIONS
-from reactorwatch.process.library.cstr.model import cstr
-from reactorwatch.process.library.cstr.operation import OPERATION as CSTR_OPERATION
-from reactorwatch.process.library.three_tanks.effects import THREE_TANKS_EFFECTS
-from reactorwatch.process.library.three_tanks.model import three_tanks
-from reactorwatch.process.library.three_tanks.operation import OPERATION as THREE_TANKS_OPERATION
+from reactorwatch.process.generic import generic_effects
+from reactorwatch.process.library import cascaded_tanks, cstr, cstr_operation, three_tanks
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.operation import Operation
 
-MODELS = (cstr, tanks, three_tanks)
+MODELS = (cstr.cstr, cascaded_tanks.tanks, three_tanks.three_tanks)
 """The catalogue of process models: functions that build them."""
 
 EFFECTS_OF: Mapping[str, tuple[Effect, ...]] = {
-    "cstr": EFFECTS,
-    "tanks": TANK_EFFECTS,
-    "three_tanks": THREE_TANKS_EFFECTS,
+    "cstr": cstr.EFFECTS,
+    "tanks": cascaded_tanks.EFFECTS,
+    "three_tanks": three_tanks.EFFECTS,
 }
 """The catalogue of effects, by name of a model."""
 
 OPERATIONS: Mapping[str, Operation] = {
-    "cstr": CSTR_OPERATION,
-    "tanks": TANK_OPERATION,
-    "three_tanks": THREE_TANKS_OPERATION,
+    "cstr": cstr_operation.OPERATION,
+    "tanks": cascaded_tanks.OPERATION,
+    "three_tanks": three_tanks.OPERATION,
 }
 """Operation in a simulation, by name of a model."""
 
-LOCATION_PHRASES: Mapping[str, str] = CSTR_LOCATIONS
+LOCATION_PHRASES: Mapping[str, str] = cstr.LOCATIONS
 """Phrases of locations whose name is not enough, such as `on the side of the coolant`."""
 
 

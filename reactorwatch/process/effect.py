@@ -7,6 +7,7 @@ has the profile's parameters as further parameters, named `<effect>.size`, `<eff
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
+from inspect import get_annotations
 from typing import Any, ClassVar
 
 import casadi as ca
@@ -44,7 +45,10 @@ class EffectConstant:
 
 
 class Effect(ABC):
-    """A physical deviation.
+    """A physical deviation: a class with its attributes, or a class of effects with the attributes of one of them.
+
+    Args:
+        **facts: attributes that the class leaves open, such as the name.
 
     Attributes:
         name: name in the catalogue of causes.
@@ -65,7 +69,11 @@ class Effect(ABC):
         is_traced: whether the monitor compares it with others after an alarm; if not, it is left to a diagnosis.
         is_source: whether it adds an unmodelled rate to a balance, which has a location but no physical meaning.
         is_noise: whether it changes the noise of a sensor and nothing else.
+        is_generic: whether it was made from a model (`generic`).
         constants: constants of its own; `add_constants` adds them to a model.
+
+    Raises:
+        TypeError: a fact is none of its attributes.
     """
 
     name: ClassVar[str]
@@ -85,7 +93,14 @@ class Effect(ABC):
     is_traced: ClassVar[bool] = True
     is_source: ClassVar[bool] = False
     is_noise: ClassVar[bool] = False
+    is_generic: ClassVar[bool] = False
     constants: ClassVar[tuple[EffectConstant, ...]] = ()
+
+    def __init__(self, **facts: Any) -> None:
+        known = {name for kind in type(self).__mro__ for name in get_annotations(kind)}
+        if unknown := facts.keys() - known:
+            raise TypeError(f"{type(self).__name__} has no attribute {', '.join(sorted(unknown))}")
+        vars(self).update(facts)
 
     @property
     def has_derivative(self) -> bool:
@@ -180,6 +195,7 @@ class ParameterEffect(Effect):
     Attributes:
         parameter: name of the parameter.
         proportional: names of parameters in proportion to it.
+        is_loss: whether m is the share that is lost, so that the factor is 1 - m.
     """
 
     unit = "1"
@@ -187,9 +203,11 @@ class ParameterEffect(Effect):
     upper = 4.0
     parameter: ClassVar[str]
     proportional: ClassVar[tuple[str, ...]] = ()
+    is_loss: ClassVar[bool] = False
 
     def apply(self, model: ProcessModel, size: ca.SX) -> ProcessModel:
         """See `Effect`."""
+        size = -size if self.is_loss else size
         for name in (self.parameter, *self.proportional):
             symbol = model.parameter(name).symbol
             model = model.substitute(symbol, symbol * (1 + size))
@@ -228,17 +246,3 @@ class SensorEffect(Effect):
             )
         extended, reading = self.sense(model, model.output(self.output).expression, size)
         return extended.with_output(replace(extended.output(self.output), expression=reading))
-
-
-def make_effect(kind: type[Effect], name: str, meaning: str, module: str, **facts: Any) -> Effect:
-    """Make an effect of a kind without a class of its own.
-
-    Args:
-        kind: class of effects that lack some of the attributes.
-        name: name in the catalogue of causes.
-        meaning: what it does, as the docstring of a class would say it.
-        module: name of the module that makes it.
-        **facts: the other attributes.
-    """
-    effect: Effect = type(name, (kind,), {"name": name, "__doc__": meaning, "__module__": module, **facts})()
-    return effect

@@ -32,10 +32,8 @@ from reactorwatch.limits import limits, parse_json
 from reactorwatch.process import EFFECTS_OF, MODELS, named_effects
 from reactorwatch.process.effect import TIMING, Effect
 from reactorwatch.process.fault import FaultSpecification, parse_fault
-from reactorwatch.process.fingerprint import fingerprint
-from reactorwatch.process.generic_effects import is_generic
 from reactorwatch.process.law import ExtendedLaw, laws_of
-from reactorwatch.process.model import ProcessModel
+from reactorwatch.process.model import ProcessModel, fingerprint
 from reactorwatch.process.profiles import FREE_NAME, PROFILES, Profile, free_profile
 from reactorwatch.process.stored_equations import build_equations, store_equations
 
@@ -214,7 +212,7 @@ def are_named(extended: ExtendedModel) -> bool:
     """True if the catalogue has the effects of an extended model, so that their names are enough."""
     own = EFFECTS_OF.get(extended.name, ())
     return all(
-        is_generic(item.effect) or any(_are_equal(item.effect, effect) for effect in own) for item in extended.effects
+        item.effect.is_generic or any(_are_equal(item.effect, effect) for effect in own) for item in extended.effects
     )
 
 

@@ -20,7 +20,7 @@ from typing import TypeVar
 
 from reactorwatch.errors import InputError, describe_unknown, prefix_errors
 from reactorwatch.process.effect import Effect, EffectConstant
-from reactorwatch.process.library.cstr.effects import EFFECTS
+from reactorwatch.process.library.cstr import EFFECTS
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.profiles import FREE_NAME, PROFILES, Profile, ProfileParameter, free_profile
 

@@ -14,9 +14,10 @@ may have changed, such as a valve that sticks (`resets`).
 """
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from hashlib import blake2b
 from typing import Protocol
 
 import casadi as ca
@@ -57,7 +58,7 @@ class Variable:
 
 @dataclass(frozen=True, eq=False)
 class Parameter:
-    """A constant of the equations. Attributes as for `Variable`; `value` is its nominal value."""
+    """A constant of the equations; attributes as for `Variable`, and `value`, its nominal value."""
 
     name: str
     value: float
@@ -241,13 +242,8 @@ class ProcessModel:
         )
 
     def parameter(self, name: str) -> Parameter:
-        """Look a parameter up by name.
-
-        Raises:
-            ValueError: there is no such parameter.
-        """
-        if name not in self._indices:
-            raise ValueError(f"{self.name} has no parameter {name!r} (it has {', '.join(self.parameter_names)})")
+        """Parameter by name; a ValueError if there is none."""
+        self._check_name("parameter", name, self._indices)
         return self.parameters[self._indices[name]]
 
     def values(self, changes: Mapping[str, float] | None = None) -> Array:
@@ -273,11 +269,7 @@ class ProcessModel:
         return {name: i for i, name in enumerate(self.parameter_names)}
 
     def with_values(self, changes: Mapping[str, float]) -> "ProcessModel":
-        """Copy with other nominal values.
-
-        Raises:
-            ValueError: as `values`.
-        """
+        """Copy with other nominal values; a ValueError as in `values`."""
         if not changes:
             return self
         parameters, values = list(self.parameters), self.values(changes)
@@ -287,13 +279,8 @@ class ProcessModel:
         return replace(self, parameters=tuple(parameters))
 
     def term(self, name: str) -> ca.SX:
-        """Look a part of the balances up by name.
-
-        Raises:
-            ValueError: there is no such term.
-        """
-        if name not in self.terms:
-            raise ValueError(f"{self.name} has no term {name!r} (it has {', '.join(self.terms) or 'none'})")
+        """Part of the balances by name; a ValueError if there is none."""
+        self._check_name("term", name, self.terms)
         return self.terms[name]
 
     def substitute(self, symbol: ca.SX, expression: ca.SX) -> "ProcessModel":
@@ -301,33 +288,27 @@ class ProcessModel:
         return self._map_expressions(lambda items: ca.substitute(items, [symbol], [expression]))
 
     def add_rate(self, state: str, rate: ca.SX) -> "ProcessModel":
-        """Copy with a further rate in the balance of a state.
-
-        Raises:
-            ValueError: there is no such state.
-        """
+        """Copy with a further rate in the balance of a state; a ValueError if there is no such state."""
         index = self.state_index(state)
         return replace(self, rhs=tuple(item + rate if i == index else item for i, item in enumerate(self.rhs)))
 
     def state_index(self, name: str) -> int:
-        """Index of a state.
-
-        Raises:
-            ValueError: there is no such state.
-        """
-        if name not in self.state_names:
-            raise ValueError(f"{self.name} has no state {name!r} (it has {', '.join(self.state_names)})")
+        """Index of a state by name; a ValueError if there is none."""
+        self._check_name("state", name, self.state_names)
         return self.state_names.index(name)
 
-    def output(self, name: str) -> Output:
-        """Look an output up by name.
+    def state(self, name: str) -> ca.SX:
+        """Symbol of a state by name; a ValueError if there is none."""
+        return self.states[self.state_index(name)].symbol
 
-        Raises:
-            ValueError: there is no such output.
-        """
-        if name not in self.output_names:
-            raise ValueError(f"{self.name} has no output {name!r} (it has {', '.join(self.output_names)})")
+    def output(self, name: str) -> Output:
+        """Output by name; a ValueError if there is none."""
+        self._check_name("output", name, self.output_names)
         return self.outputs[self.output_names.index(name)]
+
+    def _check_name(self, kind: str, name: str, names: Collection[str]) -> None:
+        if name not in names:
+            raise ValueError(f"{self.name} has no {kind} {name!r} (it has {', '.join(names) or 'none'})")
 
     def with_output(self, output: Output) -> "ProcessModel":
         """Copy with another output in place of that of its name."""
@@ -363,14 +344,7 @@ class ProcessModel:
         return replace(model, outputs=tuple(outputs))
 
     def with_state(self, state: Variable, rate: ca.SX, at_rest: ca.SX, reset: ca.SX | None = None) -> "ProcessModel":
-        """Copy with a further state.
-
-        Args:
-            state: the last state of the copy.
-            rate: balance of the state.
-            at_rest: equilibrium of the state, see `ProcessModel`.
-            reset: value of the state when a row begins, see `ProcessModel`; None: it does not jump.
-        """
+        """Copy with a further state, the last, with its balance; `at_rest` and `reset` are as in `ProcessModel`."""
         return replace(
             self,
             states=(*self.states, state),
@@ -384,9 +358,8 @@ class ProcessModel:
         resting = [state for state in self.states if state.name in self.at_rest]
         symbols, rest = [state.symbol for state in resting], [self.at_rest[state.name] for state in resting]
         result = [self.at_rest.get(state.name, state.symbol) for state in self.states]
-        while resting and ca.depends_on(
-            ca.vertcat(*result), ca.vertcat(*symbols)
-        ):  # an equilibrium may depend on another
+        # an equilibrium may depend on another
+        while resting and ca.depends_on(ca.vertcat(*result), ca.vertcat(*symbols)):
             result = ca.substitute(result, symbols, rest)
         return tuple(result)
 
@@ -441,6 +414,17 @@ class ProcessModel:
     def output_expressions(self) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX, ca.SX]:
         """Symbols x, u, p and t, and the outputs in terms of them."""
         return self.at_one_time(ca.vertcat(*(output.expression for output in self.outputs)))
+
+
+def fingerprint(model: ProcessModel) -> str:
+    """Digest of a model's equations, names and numbers."""
+    x, u, p = model.arguments()
+    memory = [*model.at_rest.values(), *model.resets.values()]
+    function = ca.Function("memory", [x, u, p], memory, {"allow_free": True})
+    words = (model.name, *model.state_names, *model.input_names, *model.output_names, *model.parameter_names)
+    texts = (*words, *model.breakpoints, *model.at_rest, *model.resets, model.function().serialize())
+    values = model.values().tobytes()
+    return blake2b("\0".join((*texts, function.serialize())).encode() + values, digest_size=16).hexdigest()
 
 
 def _check_bounds(name: str, value: float, lower: float, upper: float) -> None:

@@ -1,30 +1,237 @@
-"""Simulation of a model over an input record, with exact sensitivities.
+"""Simulation of a model over an input record.
 
-Sensitivities are propagated with the state: with x' = Phi(x, p, h) over one step, S' = Phi_x S + Phi_p, where the
-derivatives of the discrete step itself are symbolic. So they are the derivatives of exactly the numbers that `run`
-returns, not of an approximation of the continuous system.
+The method is the pair of Cash & Karp (1990), A variable order Runge-Kutta method for initial value problems with
+rapidly varying right-hand sides, ACM Trans. Math. Softw. 16(3), orders 5 and 4: six evaluations a step, error estimate
+included. On the operating branch a fixed step of 0.05 min is inside the tolerance, and a record of thousands of rows
+runs as one piece of machine code. (The pair of Dormand & Prince takes seven evaluations, the last of which would only
+save one if the input did not jump, and at this step has twice the error.) Where the estimate exceeds the tolerance (an
+upset, an ignition: the reaction then has time constants below a second) the interval is integrated with adaptive steps.
 
-An onset is a parameter like any other: it moves the edge between two steps, so it enters through their lengths. Before
-it, dh/d(onset) = +1 for the interval that ends there; after it, -1, and that interval starts later.
-
-States that jump when a row begins (`ProcessModel.resets`) do so at the end of the step before, so a trajectory has the
-state after the jump.
+A step never crosses a sample, where the input jumps, nor a breakpoint of the model. States that jump when a row begins
+(`ProcessModel.resets`) do so at the end of the step before, so a trajectory has the state after the jump.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
-from math import inf
+from functools import lru_cache
+from itertools import pairwise
+from math import inf, isfinite
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.array_function import ArrayFunction
 from reactorwatch.codegen.compiled_function import CompiledFunction
-from reactorwatch.process.effect_states import reset_function, rest_function, with_derivatives
-from reactorwatch.process.integrate import TOLERANCE, StepGrid, Stepper, step_grid, symbolic_step
 from reactorwatch.process.model import MODEL_CACHE_SIZE, ProcessModel
+
+LONGEST_STEP_MIN = 0.05
+SHORTEST_STEP_MIN = 1e-9  # 60 ns: no plant is as fast
+MAX_STEPS = 100_000
+"""Largest number of steps between two samples: some half a second. Beyond it the equations count as too stiff."""
+
+TOLERANCE = 1e-6
+"""Allowed local error of a step, relative to `Variable.scale` of each state."""
+
+MEMORY_SLACK = 100
+"""Tolerance of the states that effects add (`ProcessModel.at_rest`) over that of the process's own states. These are
+linear and stable, so errors do not grow, and after a jump of an input they respond as fast as a step is long."""
+
+_TIMES = (0.0, 1 / 5, 3 / 10, 3 / 5, 1.0, 7 / 8)
+_STAGES: tuple[tuple[float, ...], ...] = (
+    (),
+    (1 / 5,),
+    (3 / 40, 9 / 40),
+    (3 / 10, -9 / 10, 6 / 5),
+    (-11 / 54, 5 / 2, -70 / 27, 35 / 27),
+    (1631 / 55296, 175 / 512, 575 / 13824, 44275 / 110592, 253 / 4096),
+)
+_FIFTH_ORDER = (37 / 378, 0.0, 250 / 621, 125 / 594, 0.0, 512 / 1771)
+_FOURTH_ORDER = (2825 / 27648, 0.0, 18575 / 48384, 13525 / 55296, 277 / 14336, 1 / 4)
+_ERROR = tuple(fifth - fourth for fifth, fourth in zip(_FIFTH_ORDER, _FOURTH_ORDER, strict=True))
+
+
+class SimulationError(ValueError):
+    """The equations cannot be integrated further; the text says where."""
+
+
+def rest_function(model: ProcessModel) -> ca.Function:
+    """(states that are not in `at_rest`, u, p, t) -> x, with all others in equilibrium."""
+    _, u, p, t, x = model.at_one_time(ca.vertcat(*model.rest_expressions()))
+    core = ca.vertcat(*(state.symbol for state in model.states if state.name not in model.at_rest))
+    return ca.Function("rest", [core, u, p, t], [ca.densify(x)])
+
+
+def reset_function(model: ProcessModel) -> ca.Function:
+    """(x, u, p, t) -> x after the jumps at a row at t, from which on u holds."""
+    after = ca.vertcat(*(model.resets.get(state.name, state.symbol) for state in model.states))
+    *symbols, result = model.at_one_time(after)
+    return ca.Function("reset", symbols, [ca.densify(result)])
+
+
+def with_derivatives(function: ca.Function, *arguments: int) -> ca.Function:
+    """Append the derivatives of the only result with respect to some arguments, given by index."""
+    symbols = function.sx_in()
+    result = function(*symbols)
+    derivatives = (ca.densify(ca.jacobian(result, symbols[i])) for i in arguments)
+    return ca.Function(function.name(), symbols, [result, *derivatives])
+
+
+def state_time_step(model: ProcessModel, u: ca.SX, p: ca.SX, t: ca.SX, middle: ca.SX, h: ca.SX) -> ca.SX:
+    """Time step of the states in a step of the clock from t to t + h; see `ProcessModel.time_offset`."""
+    clock = model.clock
+    if not ca.depends_on(model.time_offset, ca.vertcat(clock.now, clock.middle)):
+        return h
+    _, inputs, parameters = model.arguments()
+    ahead = ca.Function("ahead", [inputs, parameters, clock.now, clock.middle], [model.time_offset])
+    return h - (ahead(u, p, t + h, middle) - ahead(u, p, t, middle))
+
+
+@lru_cache(maxsize=MODEL_CACHE_SIZE)
+def symbolic_step(model: ProcessModel) -> ca.Function:
+    """One step as a CasADi function (x, u, p, t, t_middle, h) -> (x at t + h, error estimate over scale).
+
+    The error estimate is the largest over the states, a scalar.
+    """
+    rhs = model.function("rhs")
+    x, u, p = model.arguments()
+    t, middle, h = ca.SX.sym("t"), ca.SX.sym("t_middle"), ca.SX.sym("h")
+    passed, slopes = state_time_step(model, u, p, t, middle, h), list[ca.SX]()
+    for time, weights in zip(_TIMES, _STAGES, strict=True):
+        slopes.append(rhs(x + passed * _weighted_sum(weights, slopes), u, p, t + time * h, middle)[0])
+    after = x + passed * _weighted_sum(_FIFTH_ORDER, slopes)
+    error = passed * _weighted_sum(_ERROR, slopes)
+    scales = ca.DM([state.scale * (MEMORY_SLACK if state.name in model.at_rest else 1) for state in model.states])
+    return ca.Function(
+        "step",
+        [x, u, p, t, middle, h],
+        [after, ca.mmax(ca.fabs(error / scales))],
+        ["x", "u", "p", "t", "t_middle", "h"],
+        ["x_next", "error"],
+    )
+
+
+def _weighted_sum(weights: tuple[float, ...], slopes: list[ca.SX]) -> ca.SX:
+    terms = (weight * slope for weight, slope in zip(weights, slopes, strict=True) if weight)
+    return sum(terms, ca.SX(0))
+
+
+@dataclass(frozen=True, eq=False)
+class StepGrid:
+    """Consecutive integration steps of a run, which end at every sample and every breakpoint.
+
+    Attributes:
+        start_min: start of each step, shape (steps,).
+        length_min: length of each step, shape (steps,).
+        middle_min: middle of the interval without a jump that contains the step, shape (steps,).
+        row: row of the record whose input holds, shape (steps,).
+        end_of_row: index of the step that ends at the following row, shape (rows - 1,).
+    """
+
+    start_min: Array
+    length_min: Array
+    middle_min: Array
+    row: NDArray[np.int64]
+    end_of_row: NDArray[np.int64]
+
+
+def step_grid(time_min: Array, breakpoints: Array) -> StepGrid:
+    """Make steps that end at every sample and every breakpoint.
+
+    A breakpoint on a sample opens an interval of zero length before it.
+
+    Args:
+        time_min: shape (rows,), increasing.
+        breakpoints: shape (n,), times in minutes; those outside the record have no effect.
+    """
+    inside = np.flatnonzero((breakpoints >= time_min[0]) & (breakpoints < time_min[-1]))
+    edges = np.sort(np.concatenate([time_min, breakpoints[inside]]), kind="stable")
+    interval = np.diff(edges)
+    middle = np.minimum(0.5 * (edges[:-1] + edges[1:]), np.nextafter(edges[1:], -np.inf))  # before the jump at its end
+    counts = np.maximum(np.ceil(interval / LONGEST_STEP_MIN - 1e-9).astype(np.int64), 1)
+    part = np.repeat(np.arange(interval.size), counts)
+    position = np.arange(part.size) - np.repeat(np.cumsum(counts) - counts, counts)
+    share = 1.0 / counts[part]
+    row = np.searchsorted(time_min, edges[:-1], side="right") - 1
+    ends = np.cumsum(counts) - 1
+    return StepGrid(
+        start_min=edges[part] + position * share * interval[part],
+        length_min=share * interval[part],
+        middle_min=middle[part],
+        row=row[part],
+        end_of_row=ends[np.searchsorted(edges[1:], time_min[1:], side="left")],
+    )
+
+
+class Stepper:
+    """Integrates a model with adaptive steps.
+
+    Args:
+        model: the process.
+    """
+
+    def __init__(self, model: ProcessModel) -> None:
+        self._model = model
+        self._step = ArrayFunction(symbolic_step(model))
+        self._breakpoints = [model.parameter_names.index(name) for name in model.breakpoints]
+        self._reset = ArrayFunction(reset_function(model)) if model.resets else None
+
+    def start_row(self, x: Array, u: Array, p: Array, time_min: float) -> Array:
+        """State after the jumps (`ProcessModel.resets`) at a row, from which on u is the input."""
+        if self._reset is None:
+            return x
+        after: Array = self._reset.call(x, u, p, time_min)[0][0]
+        return after
+
+    def advance(self, x: Array, u: Array, p: Array, start_min: float, end_min: float) -> Array:
+        """State at the end of an interval of plant time over which the input is constant.
+
+        Raises:
+            SimulationError: the equations cannot be integrated further.
+        """
+        jumps = sorted({float(p[i]) for i in self._breakpoints if start_min < p[i] < end_min})
+        edges = [start_min, *jumps, end_min]
+        for left, right in pairwise(edges):
+            x, _ = self.integrate(x, u, p, left, right - left, 0.5 * (left + right))
+        return x
+
+    def integrate(
+        self, x: Array, u: Array, p: Array, start_min: float, length_min: float, middle_min: float
+    ) -> tuple[Array, int]:
+        """Integrate over an interval without a jump; returns the state at its end and the number of steps.
+
+        Raises:
+            SimulationError: no step, however short, keeps the tolerance, or too many are needed.
+        """
+        state, inputs, parameters, time, middle, length = (argument[0] for argument in self._step.arguments)
+        after, estimate = (result[0] for result in self._step.results)
+        state[:], inputs[:], parameters[:], middle[0] = x, u, p, middle_min
+        done, step, count = 0.0, min(length_min, LONGEST_STEP_MIN), 0
+        while done < length_min:
+            step = min(step, length_min - done)
+            if length_min - done - step < 1e-12 * length_min:
+                step = length_min - done
+            time[0], length[0] = start_min + done, step
+            self._step()
+            error = estimate.item() / TOLERANCE
+            good = isfinite(error) and bool(np.isfinite(after).all())
+            if good and error <= 1.0:
+                done += step
+                count += 1
+                state[:] = after
+                step = min(LONGEST_STEP_MIN, step * min(5.0, 0.9 * max(error, 1e-10) ** -0.2))
+                stuck = count > MAX_STEPS
+            else:
+                step *= max(0.1, 0.9 * error**-0.2) if good else 0.1
+                stuck = step < SHORTEST_STEP_MIN
+            if stuck:
+                where = zip(self._model.states, state.tolist(), strict=True)
+                values = ", ".join(f"{item.name} = {value:g} {item.unit}" for item, value in where)
+                raise SimulationError(
+                    f"{self._model.name} cannot be integrated beyond {start_min + done:g} min, where {values}"
+                )
+        return state.copy(), count
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,21 +249,6 @@ class Trajectory:
     outputs: Array
 
 
-@dataclass(frozen=True, eq=False)
-class Sensitivities:
-    """Derivatives of a trajectory with respect to parameters.
-
-    Attributes:
-        names: names of the parameters.
-        states: shape (rows, n_x, n_p).
-        outputs: shape (rows, n_y, n_p).
-    """
-
-    names: tuple[str, ...]
-    states: Array
-    outputs: Array
-
-
 class Simulator:
     """Simulates one model; keeps its compiled code. Not thread-safe.
 
@@ -67,8 +259,9 @@ class Simulator:
     def __init__(self, model: ProcessModel) -> None:
         self.model = model
         self._n_core = sum(state.name not in model.at_rest for state in model.states)
+        self._breakpoints = [model.parameter_names.index(name) for name in model.breakpoints]
+        self._complete = rest_function(model)
         self._stepper = Stepper(model)
-        self._sensitivity_codes: dict[tuple[int, ...], CompiledFunction] = {}
 
     def run(
         self,
@@ -91,109 +284,20 @@ class Simulator:
             SimulationError: the equations cannot be integrated further.
         """
         inputs, start, p = self._check(time_min, inputs, start, changes)
-        start, _, _ = self._complete_start(start, inputs, p, time_min)
-        grid = self._grid(time_min, p)
-        states, _ = self._run_steps(grid, inputs, start, p)
-        return self._trajectory(time_min, inputs, p, np.vstack([start, states[grid.end_of_row]]))
+        start = self._complete_start(start, inputs[0], p, float(time_min[0]))
+        grid = step_grid(time_min, p[self._breakpoints])
+        states = np.vstack([start, self._run_steps(grid, inputs, start, p)[grid.end_of_row]])
+        (y,) = _compiled_outputs(self.model).map(states, inputs, p, time_min)
+        return Trajectory(time_min, states, y[:, :, 0])
 
-    def run_with_sensitivities(
-        self,
-        time_min: Array,
-        inputs: Array,
-        start: Array,
-        names: Sequence[str],
-        changes: Mapping[str, float] | None = None,
-        start_sensitivity: Array | None = None,
-    ) -> tuple[Trajectory, Sensitivities]:
-        """Simulate, with derivatives with respect to some parameters.
+    def _complete_start(self, start: Array, u: Array, p: Array, start_min: float) -> Array:
+        """Full state after the jumps at the first row."""
+        if start.size < len(self.model.states):
+            start = np.array(self._complete(start, u, p, start_min)).ravel()
+        return self._stepper.start_row(start, u, p, start_min)
 
-        Args:
-            time_min: shape (rows,).
-            inputs: shape (rows, n_u) or (rows,).
-            start: initial state, see `run`.
-            names: the parameters to differentiate with respect to.
-            changes: parameters that differ from the model's values.
-            start_sensitivity: d start / d parameters, shape (start.size, len(names)); zero if not given.
-
-        Raises:
-            ValueError: as `run`, or an unknown parameter.
-            SimulationError: as `run`.
-        """
-        inputs, start, p = self._check(time_min, inputs, start, changes)
-        wanted = [self.model.parameter_names.index(self.model.parameter(name).name) for name in names]
-        shape = (start.size, len(wanted))
-        initial = np.zeros(shape) if start_sensitivity is None else np.array(start_sensitivity, dtype=float)
-        if initial.shape != shape:
-            raise ValueError(f"start_sensitivity must have shape {shape}, got {initial.shape}")
-        start, by_start, by_p = self._complete_start(start, inputs, p, time_min)
-        initial = by_start @ initial + by_p[:, wanted]
-        grid = self._grid(time_min, p)
-        states, cuts = self._run_steps(grid, inputs, start, p)
-        trajectory = self._trajectory(time_min, inputs, p, np.vstack([start, states[grid.end_of_row]]))
-        grid = grid.refine(cuts)
-        of_states = self._run_sensitivities(grid, inputs, start, p, wanted, initial)
-        of_states = np.concatenate([initial[None], of_states[grid.end_of_row]])
-        by_x, by_p = self._output_derivatives.map(trajectory.states, inputs, p, time_min)
-        of_outputs: Array = by_x @ of_states + by_p[:, :, wanted]
-        return trajectory, Sensitivities(tuple(names), of_states, of_outputs)
-
-    # --- compiled once a model -----------------------------------------------------------------------
-
-    def _sensitivity_code(self, wanted: tuple[int, ...]) -> CompiledFunction:
-        """(x, S, u, p, t, t_middle, h, dt, dh) -> (x, S) after the step, for the parameters of these indices."""
-        if wanted not in self._sensitivity_codes:
-            self._sensitivity_codes[wanted] = self._new_sensitivity_code(wanted)
-        return self._sensitivity_codes[wanted]
-
-    def _new_sensitivity_code(self, wanted: tuple[int, ...]) -> CompiledFunction:
-        step = _row_step(self.model)
-        n_x, n = len(self.model.states), len(wanted)
-        x, u, p, t, middle, h = step.sx_in()
-        S, of_t, of_h = ca.SX.sym("S", n_x, n), ca.SX.sym("of_t", 1, n), ca.SX.sym("of_h", 1, n)
-        after = step(x, u, p, t, middle, h)[0]
-        S_after = (
-            ca.mtimes(ca.jacobian(after, x), S)
-            + ca.jacobian(after, p)[:, list(wanted)]
-            + ca.mtimes(ca.jacobian(after, t), of_t)
-            + ca.mtimes(ca.jacobian(after, h), of_h)
-        )
-        one = ca.Function("sensitivities", [x, S, u, p, t, middle, h, of_t, of_h], [after, S_after])
-        return CompiledFunction(one, shared=[3], chained=2)
-
-    @cached_property
-    def _output_derivatives(self) -> CompiledFunction:
-        """(x, u, p, t) -> dy/dx, dy/dp."""
-        x, u, p, t, y = self.model.output_expressions()
-        by = ca.Function("outputs_by", [x, u, p, t], [ca.jacobian(y, x), ca.jacobian(y, p)])
-        return CompiledFunction(by, shared=[2])
-
-    @cached_property
-    def _complete(self) -> ArrayFunction:
-        """(x without the states of `at_rest`, u, p, t) -> (x, its derivatives with respect to the argument and p)."""
-        return ArrayFunction(with_derivatives(rest_function(self.model), 0, 2))
-
-    @cached_property
-    def _reset(self) -> ArrayFunction:
-        """(x, u, p, t) -> (x after the jumps at a row, its derivatives with respect to x and p)."""
-        return ArrayFunction(with_derivatives(reset_function(self.model), 0, 2))
-
-    # --- simulation ---------------------------------------------------------------------------------------------
-
-    def _complete_start(self, start: Array, inputs: Array, p: Array, time_min: Array) -> tuple[Array, Array, Array]:
-        """Full state after the jumps at the first row, and its derivatives with respect to `start` and p."""
-        x, by_start, by_p = start, np.eye(start.size), np.zeros((start.size, p.size))
-        missing, model = start.size < len(self.model.states), self.model
-        for function in (*((self._complete,) if missing else ()), *((self._reset,) if model.resets else ())):
-            after, by_x, further = function.call(x, inputs[0], p, time_min[0])
-            x, by_start, by_p = after[0], by_x.T @ by_start, by_x.T @ by_p + further.T
-        return x, by_start, by_p
-
-    def _grid(self, time_min: Array, p: Array) -> StepGrid:
-        indices = [self.model.parameter_names.index(name) for name in self.model.breakpoints]
-        return step_grid(time_min, p[indices])
-
-    def _run_steps(self, grid: StepGrid, inputs: Array, start: Array, p: Array) -> tuple[Array, dict[int, Array]]:
-        """State after each step, and the lengths into which steps were cut to keep the tolerance.
+    def _run_steps(self, grid: StepGrid, inputs: Array, start: Array, p: Array) -> Array:
+        """State after each step.
 
         The compiled steps run until one breaks the tolerance; from there on the stepper integrates until one step needs
         no cutting, and they resume after it.
@@ -201,7 +305,6 @@ class Simulator:
         steps = grid.length_min.size
         states, good = np.empty((steps, start.size)), np.empty(steps)
         columns = self._columns(grid, inputs)
-        cuts: dict[int, Array] = {}
         code = _compiled_steps(self.model)
         x, first, ends = start, 0, set(grid.end_of_row.tolist())
         while first < steps:
@@ -212,27 +315,14 @@ class Simulator:
             cutting = True
             while cutting and first < steps:
                 t, h, middle = grid.start_min[first], grid.length_min[first], grid.middle_min[first]
-                x, lengths = self._stepper.integrate(x, inputs[grid.row[first]], p, float(t), float(h), float(middle))
-                cutting = lengths.size > 1
-                if cutting:
-                    cuts[first] = lengths
+                x, parts = self._stepper.integrate(x, inputs[grid.row[first]], p, float(t), float(h), float(middle))
+                cutting = parts > 1
                 if self.model.resets and first in ends:
                     row = grid.row[first] + 1
                     x = self._stepper.start_row(x, inputs[row], p, float(t + h))
                 states[first] = x
                 first += 1
-        return states, cuts
-
-    def _run_sensitivities(
-        self, grid: StepGrid, inputs: Array, start: Array, p: Array, wanted: list[int], initial: Array
-    ) -> Array:
-        """d(state after each step)/dp, shape (steps, n_x, n), on a grid that keeps the tolerance."""
-        u, *times = self._columns(grid, inputs)
-        code = self._sensitivity_code(tuple(wanted))
-        results = code.allocate_results(grid.length_min.size)
-        edges = self._edge_derivatives(grid, wanted)
-        code.fill(grid.length_min.size, [start, np.ascontiguousarray(initial.T), u, p, *times, *edges], results)
-        return results[1].transpose(0, 2, 1)
+        return states
 
     def _columns(self, grid: StepGrid, inputs: Array) -> tuple[Array, Array, Array, Array]:
         """Arguments of every step: u as in `_row_step`, its start, the middle of its interval and its length."""
@@ -241,26 +331,6 @@ class Simulator:
             last = np.isin(np.arange(grid.row.size), grid.end_of_row)
             u = np.column_stack([u, inputs[grid.row + last], last])
         return np.ascontiguousarray(u, dtype=np.float64), grid.start_min, grid.middle_min, grid.length_min
-
-    def _edge_derivatives(self, grid: StepGrid, wanted: list[int]) -> tuple[Array, Array]:
-        """d(start of step)/dp and d(length of step)/dp, each of shape (steps, n)."""
-        steps = grid.length_min.size
-        of_time, of_length = np.zeros((steps, len(wanted))), np.zeros((steps, len(wanted)))
-        for i, name in enumerate(self.model.breakpoints):
-            index = self.model.parameter_names.index(name)
-            if index not in wanted:
-                continue
-            column = wanted.index(index)
-            opens, closes = grid.origin == i, grid.target == i
-            of_length[opens, column] -= grid.share[opens]
-            of_time[opens, column] += 1.0 - grid.share_before[opens]
-            of_length[closes, column] += grid.share[closes]
-            of_time[closes, column] += grid.share_before[closes]
-        return of_time, of_length
-
-    def _trajectory(self, time_min: Array, inputs: Array, p: Array, states: Array) -> Trajectory:
-        (y,) = _compiled_outputs(self.model).map(states, inputs, p, time_min)
-        return Trajectory(time_min, states, y[:, :, 0])
 
     def _check(
         self, time_min: Array, inputs: Array, start: Array, changes: Mapping[str, float] | None

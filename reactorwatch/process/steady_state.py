@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.compiled_function import CompiledFunction
 from reactorwatch.errors import InputError
-from reactorwatch.process.effect_states import rest_function
 from reactorwatch.process.linearise import linearise
 from reactorwatch.process.model import ProcessModel
+from reactorwatch.process.simulate import rest_function
 
 STARTS = 1024
 ITERATIONS = 80

@@ -21,20 +21,19 @@ import numpy as np
 from scipy import linalg, special
 
 from reactorwatch.arrays import Array
-from reactorwatch.spc.m_of_n import false_alarm_rates
+from reactorwatch.spc.run_length import false_alarm_rates
 
 POWER = 0.9
 """Share of the cases in which a deviation is seen in time."""
 
-_NODES, _LATE_NODES = 40, 8
-_BLOCK = 64
-"""Rows that are smoothed at once."""
-_STEPS = 11
-"""Bisections of 25 units of the logarithm, before the last interpolation."""
-_LOWEST, _HIGHEST = -4.0, 9.0
-_LEAST_HAZARD, _MOST_HAZARD = 1e-15, 1.0 - 1e-9
-_RARE = 4.0
-"""Distance from the limit, in standard deviations, from which on a crossing does not depend on rows before the last."""
+LATE_NODES = 8
+"""Nodes that stand for all rows beyond a path."""
+
+LOWEST = -4.0
+"""Lowest distance from the limit, in standard deviations: a point there is out almost surely."""
+
+HAZARDS = 1e-15, 1.0 - 1e-9
+"""Bounds of the probability of a crossing, whose logarithms are taken."""
 
 
 class Detector(NamedTuple):
@@ -86,7 +85,7 @@ def smallest_sizes(paths: Array, detectors: Sequence[Detector], horizons: Sequen
     log_size = np.full(shape, -np.log(largest))
     low, high = log_size - 5.0, log_size + 20.0
     at_low, at_high = np.full((2, *shape), np.nan)
-    for _ in range(_STEPS):
+    for _ in range(11):  # bisections of 25 units of the logarithm, before the last interpolation
         middle = 0.5 * (low + high)
         log_missed = np.min([_miss_log_probability(chart, path, np.exp(middle)) for chart, path in charts], axis=0)
         missed = np.clip(np.exp(log_missed).mean(axis=2), 1e-300, 1.0 - 1e-16)
@@ -107,25 +106,25 @@ def _chart_path(paths: Array, chart: Detector, horizons: Sequence[float], ramp_r
         signals = np.cumsum(signals, axis=2) / ramp_rows
     unit = sqrt(chart.weight / (2.0 - chart.weight))
     smoothed = _ewma(signals, chart.weight) / unit
-    nodes = np.unique(np.geomspace(1.0, rows, _NODES).round().astype(int))
+    nodes = np.unique(np.geomspace(1.0, rows, 40).round().astype(int))
     ends = np.concatenate([0.5 * (nodes[1:] + nodes[:-1] + 1), [rows + 1.0]])
     starts = np.concatenate([[1.0], ends[:-1]])
     counts = [np.clip(np.minimum(ends, horizon + 1.0) - starts, 0.0, None) for horizon in horizons]
     beyond = np.array([max(horizon - rows, 0.0) for horizon in horizons])
     if ramp_rows:
-        times = rows + np.outer(beyond, (np.arange(_LATE_NODES) + 0.5) / _LATE_NODES)
+        times = rows + np.outer(beyond, (np.arange(LATE_NODES) + 0.5) / LATE_NODES)
         slope = later.mean(axis=2) / (ramp_rows * unit)
         end = signals[:, :, -1] / unit
         late = end[:, :, None] + slope[:, :, None] * (times.ravel()[None, None, :, None] - rows)
         late_size = np.linalg.norm(late, axis=3)
         late_rows = np.zeros((len(horizons), times.size))
         for index, count in enumerate(beyond):
-            late_rows[index, index * _LATE_NODES : (index + 1) * _LATE_NODES] = count / _LATE_NODES
+            late_rows[index, index * LATE_NODES : (index + 1) * LATE_NODES] = count / LATE_NODES
     else:
-        shares = (np.arange(_LATE_NODES) + 0.5) / _LATE_NODES
+        shares = (np.arange(LATE_NODES) + 0.5) / LATE_NODES
         sizes = np.linalg.norm(smoothed[:, :, rows // 2 :], axis=3)
         late_size = np.moveaxis(np.quantile(sizes, shares, axis=2), 0, 2)
-        late_rows = np.repeat(beyond[:, None] / _LATE_NODES, _LATE_NODES, axis=1)
+        late_rows = np.repeat(beyond[:, None] / LATE_NODES, LATE_NODES, axis=1)
     mean = np.concatenate([np.linalg.norm(smoothed[:, :, nodes - 1], axis=3), late_size], axis=2)
     return _Path(mean, np.hstack([np.array(counts), late_rows]))
 
@@ -134,12 +133,13 @@ def _ewma(signals: Array, weight: float) -> Array:
     """EWMA of signals over their rows, the third axis; `scipy.signal` has it, and takes half a second to import."""
     if weight == 1.0:
         return signals
-    lag = np.subtract.outer(np.arange(_BLOCK), np.arange(_BLOCK))
+    size = 64  # rows that are smoothed at once
+    lag = np.subtract.outer(np.arange(size), np.arange(size))
     weights = np.where(lag >= 0, weight * (1.0 - weight) ** np.maximum(lag, 0), 0.0)
-    kept = ((1.0 - weight) ** np.arange(1, _BLOCK + 1))[:, None]
+    kept = ((1.0 - weight) ** np.arange(1, size + 1))[:, None]
     smoothed, last = np.empty_like(signals), np.zeros_like(signals[:, :, :1])
-    for start in range(0, signals.shape[2], _BLOCK):
-        block = signals[:, :, start : start + _BLOCK]
+    for start in range(0, signals.shape[2], size):
+        block = signals[:, :, start : start + size]
         rows = block.shape[2]
         smoothed[:, :, start : start + rows] = weights[:rows, :rows] @ block + kept[:rows] * last
         last = smoothed[:, :, start + rows - 1 : start + rows]
@@ -168,19 +168,19 @@ def _miss_log_probability(chart: Detector, path: _Path, sizes: Array) -> Array:
 @cache
 def _log_within(weight: float, count: int, window: int) -> tuple[Array, Array]:
     """Grid of distances u from the limit, and the logarithm of the probability to stay within it for one row."""
-    grid = np.linspace(_LOWEST, _HIGHEST, 53)
+    grid = np.linspace(LOWEST, 9.0, 53)
     if count > 1:
         rates = false_alarm_rates(count, window, np.clip(special.ndtr(-grid), 1e-12, 1.0))
-        return grid, np.log1p(-np.clip(rates, _LEAST_HAZARD, _MOST_HAZARD))
+        return grid, np.log1p(-np.clip(rates, *HAZARDS))
     kept, spread = 1.0 - weight, sqrt(weight * (2.0 - weight))
     nodes, weights = np.polynomial.legendre.leggauss(200)
-    before = _LOWEST - 3.0 + 0.5 * (grid[:, None] - _LOWEST + 3.0) * (nodes + 1.0)
-    scaled = 0.5 * (grid[:, None] - _LOWEST + 3.0) * weights
+    before = LOWEST - 3.0 + 0.5 * (grid[:, None] - LOWEST + 3.0) * (nodes + 1.0)
+    scaled = 0.5 * (grid[:, None] - LOWEST + 3.0) * weights
     density = np.exp(-0.5 * before**2) / np.sqrt(2.0 * np.pi) * scaled
     crossing = np.sum(density * special.ndtr(-(grid[:, None] - kept * before) / spread), axis=1)
-    log_within = np.log1p(-np.clip(crossing / np.maximum(density.sum(axis=1), 1e-300), _LEAST_HAZARD, _MOST_HAZARD))
+    log_within = np.log1p(-np.clip(crossing / np.maximum(density.sum(axis=1), 1e-300), *HAZARDS))
     if weight < 1.0:
-        near = grid <= _RARE
+        near = grid <= 4.0  # further off a crossing does not depend on rows before the last
         log_within[near] = np.log(_remaining_shares(grid[near], kept, spread))
     return grid, log_within
 
@@ -191,7 +191,7 @@ def _remaining_shares(limits: Array, kept: float, spread: float) -> Array:
     The largest eigenvalue of the transitions below the limit, which reversibility makes symmetric.
     """
     cell = min(0.1, 0.5 * spread)
-    lowest = _LOWEST - 2.0
+    lowest = LOWEST - 2.0
     shares = []
     for limit in limits.tolist():
         at = np.arange(limit - 0.5 * cell, lowest, -cell)
@@ -200,4 +200,4 @@ def _remaining_shares(limits: Array, kept: float, spread: float) -> Array:
         transitions *= cell / (spread * sqrt(2.0 * np.pi))
         last = len(at) - 1
         shares.append(float(linalg.eigh(transitions, eigvals_only=True, subset_by_index=(last, last))[0]))
-    return np.clip(shares, 1.0 - _MOST_HAZARD, 1.0 - _LEAST_HAZARD)
+    return np.clip(shares, 1.0 - HAZARDS[1], 1.0 - HAZARDS[0])

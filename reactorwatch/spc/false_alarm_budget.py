@@ -5,37 +5,66 @@ times as often. Here the number is promised for the plant, in alarms per 30 days
 it. Whatever the charts have in common, the expected number of alarms is the sum of theirs, so the promise is not a
 bound but an expectation. (Alarms that come together are one incident: of these there are fewer.)
 
-Limits for a share come from the run lengths in `spc.run_length`, which hold when mean and standard deviation are
-known. They are learned from n rows, and a limit that ignores it is too tight: Jones, Champ & Rigdon (2001), The
-performance of exponentially weighted moving average charts with estimated parameters, Technometrics 43, find
-a run length of 200 fall to 145. An average of weight lambda has the variance lambda / (2 - lambda); the mean that was
-learned adds 1 / n to it, and the standard deviation that was learned makes a normal number into one of Student's, with
-the degrees of freedom nu that belong to the variance 1 / (2 nu) of its relative error. So the limit L becomes
+Limits for a share come from the run lengths of the charts, which hold when mean and standard deviation are known. They
+are learned from n rows, and a limit that ignores it is too tight: Jones, Champ & Rigdon (2001), The performance of
+exponentially weighted moving average charts with estimated parameters, Technometrics 43, find a run length of 200 fall
+to 145. An average of weight lambda has the variance lambda / (2 - lambda); the mean that was learned adds 1 / n to it,
+and the standard deviation that was learned makes a normal number into one of Student's, with the degrees of freedom nu
+that belong to the variance 1 / (2 nu) of its relative error. So the limit L becomes
 
     sqrt(1 + (2 - lambda) / (lambda n)) t_nu^-1(Phi(L)),
 
 the one that a new average crosses as rarely as L is crossed when all is known. That is Student's prediction interval
 (Hahn 1970, Additional factors for calculating prediction intervals, J. Amer. Statist. Assoc. 65); several signals:
-`estimated_t2`. It holds on average over trainings: one plant may have been lucky with its training, another
+`charts/t2.py`. It holds on average over trainings: one plant may have been lucky with its training, another
 not.
+
+The promise holds on average over trainings. The rate of one plant depends on the errors of its own training: with the
+true standard deviation s and mean m of a residual, in units of the learned standard deviation, an average of weight
+lambda crosses its widened limit W about
+
+    [Phi(-(W - d) / s) + Phi(-(W + d) / s)] / [2 Phi(-L)],      d = m sqrt((2 - lambda) / lambda),
+
+times as often as intended, L being the limit that holds when all is known: the approximation by which limits are
+widened. Seen from the training, s^2 is nu / chi2(nu), and m / s normal with the variance 1 / n (the fiducial
+distribution of Student's interval). An upper quantile of the rate over these errors is what a plant keeps with that
+confidence: a tolerance bound instead of the mean (Hahn & Meeker 1991, Statistical Intervals, ch. 4; for control
+charts Gandy & Kvaloy 2013, Guaranteed conditional performance of control charts via bootstrap methods, Scandinavian
+Journal of Statistics 40). The errors of one signal are the same for all its charts, so rates are summed draw by draw.
+New residuals vary more than those to which the autoregression was fitted: by 1 / n for each coefficient that it could
+have had.
 """
 
-from collections.abc import Callable
-from functools import lru_cache
+from collections.abc import Callable, Sequence
+from functools import cache, lru_cache
 from math import ceil, comb, exp, floor, log, log10, sqrt
+from typing import NamedTuple
 
+import numpy as np
 from scipy import special
 
+from reactorwatch.arrays import Array
 from reactorwatch.errors import InputError
-from reactorwatch.spc.m_of_n import false_alarm_rate
-from reactorwatch.spc.prewhitening import Prewhitening
-from reactorwatch.spc.run_length.control_limits import LONGEST_DESIGN, SHORTEST
+from reactorwatch.spc.prewhitening import LARGEST_ORDER, Prewhitening
+from reactorwatch.spc.run_length import LONGEST_DESIGN, SHORTEST_DESIGN, false_alarm_rate
 
 DAYS = 30
+"""Days for which false alarms are promised."""
+
 DAYS_MIN = DAYS * 24 * 60.0
 
 USUAL_PER_30_DAYS = 1.0
 """False alarms of a plant that are promised where the settings ask for no number."""
+
+SHORTEST_ARL0 = 10 * SHORTEST_DESIGN
+"""Shortest run length of an alarm, in rows: more frequent alarms are no promise."""
+
+CONFIDENCE, QUANTILE = 0.9, 0.93
+"""Confidence of the bound of a plant's rate, and the quantile that is taken: rates by tails are good to some percent
+(`make promise` holds the bound to simulation)."""
+
+DRAWS, SEED = 400, 20_260_523
+"""Draws of the errors of a training, of which the quantile is the 28th largest; always the same ones."""
 
 
 def promise_per_30_days(asked: float | None, alarms: int, period_min: float) -> float:
@@ -50,7 +79,7 @@ def promise_per_30_days(asked: float | None, alarms: int, period_min: float) -> 
         InputError: charts cannot keep what is asked for.
     """
     rows = DAYS_MIN / period_min * alarms
-    fewest, most = rows / LONGEST_DESIGN, rows / (10 * SHORTEST)
+    fewest, most = rows / LONGEST_DESIGN, rows / (SHORTEST_ARL0)
     if asked is None:
         return min(max(USUAL_PER_30_DAYS, fewest), most)
     if not fewest <= asked <= most:
@@ -76,7 +105,7 @@ def share_arl0(per_30_days: float, alarms: int, period_min: float) -> float:
         alarms: number of alarms that share them.
         period_min: sampling period of the rows.
     """
-    return min(max(DAYS_MIN / period_min * alarms / per_30_days, 10 * SHORTEST), LONGEST_DESIGN)
+    return min(max(DAYS_MIN / period_min * alarms / per_30_days, SHORTEST_ARL0), LONGEST_DESIGN)
 
 
 @lru_cache(maxsize=64)
@@ -85,8 +114,8 @@ def point_probability(arl0: float, raise_count: int, window: int) -> float:
 
     Args:
         arl0: run length to the alarm without a fault.
-        raise_count: see `m_of_n`.
-        window: see `m_of_n`.
+        raise_count: see `false_alarm_rates`.
+        window: see `false_alarm_rates`.
     """
     from scipy import optimize  # only here: to import it is a tenth of a start
 
@@ -118,3 +147,80 @@ def degrees_of_freedom(learned: Prewhitening, weight: float) -> float:
 def scale_variance(learned: Prewhitening, weight: float) -> float:
     """Variance of the relative error of that standard deviation, for such a chart."""
     return learned.sd_variance + (1.0 - weight) ** 2 * learned.passed_variance
+
+
+# --- errors of the training --------------------------------------------------------------------------------------
+
+
+class TrainingErrors(NamedTuple):
+    """Errors that the trainings of some signals may have made, as standard normal numbers, one row a draw.
+
+    Attributes:
+        scale: error of the standard deviation, shape (draws, signals).
+        passed: error of the part of a lasting shift that the prewhitened residual shows, same shape.
+        mean: error of the mean, same shape.
+    """
+
+    scale: Array
+    passed: Array
+    mean: Array
+
+    @classmethod
+    def draw(cls, signals: int) -> "TrainingErrors":
+        """Draw errors of a number of signals; always the same ones."""
+        return cls(*_draw(signals))
+
+    def of(self, signals: Sequence[int]) -> "TrainingErrors":
+        """Errors of some of the signals, by their indices."""
+        return TrainingErrors(*(item[:, list(signals)] for item in self))
+
+    def true_scale(self, signal: int, learned: Prewhitening, weight: float) -> Array:
+        """True standard deviation, over the learned one, as an average with this weight shows it, shape (draws,)."""
+        freedom = degrees_of_freedom(learned, weight)
+        known = scale_variance(learned, weight)
+        own, passed = sqrt(learned.sd_variance), (1.0 - weight) * sqrt(learned.passed_variance)
+        mixed = (own * self.scale[:, signal] + passed * self.passed[:, signal]) / sqrt(max(known, 1e-300))
+        return np.asarray(np.sqrt((1.0 + LARGEST_ORDER / learned.rows) * freedom / _chi2(freedom, mixed)))
+
+
+def _chi2(freedom: float, errors: Array) -> Array:
+    """Chi-squares with these degrees of freedom whose errors are standard normal numbers."""
+    return np.asarray(2.0 * special.gammainccinv(0.5 * freedom, special.ndtr(-errors)))
+
+
+def student_tail(limit: float, freedom: float, errors: Array) -> Array:
+    """Probability that an average is beyond a limit, by errors of its estimated variance, same shape as the errors.
+
+    Args:
+        limit: limit in estimated standard deviations.
+        freedom: degrees of freedom of the variance.
+        errors: errors of the variance, see `TrainingErrors.scale`.
+    """
+    return np.asarray(special.ndtr(-limit * np.sqrt(_chi2(freedom, errors) / freedom)))
+
+
+@cache
+def _draw(signals: int) -> tuple[Array, Array, Array]:
+    numbers = np.random.default_rng(SEED).standard_normal((signals, 3, DRAWS))
+    scale, passed, mean = (np.ascontiguousarray(numbers[:, i].T) for i in range(3))
+    return scale, passed, mean
+
+
+def relative_rate(limit: float, weight: float, learned: Prewhitening, errors: TrainingErrors) -> Array:
+    """Rate of a chart of one signal, relative to the intended one, shape (draws,).
+
+    Args:
+        limit: limit that holds when all is known, in standard deviations of the average.
+        weight: weight of the newest value in the average.
+        learned: the training.
+        errors: errors of this signal.
+    """
+    wide = widen_limit(limit, weight, learned)
+    scale = errors.true_scale(0, learned, weight)
+    shift = scale * errors.mean[:, 0] * sqrt((2.0 - weight) / (weight * learned.rows))
+    return two_sided_tail(wide, shift, scale) / (2.0 * special.ndtr(-limit))
+
+
+def two_sided_tail(limit: float, mean: Array, sd: Array) -> Array:
+    """Probability that a normal number is beyond +- a limit."""
+    return np.asarray(special.ndtr(-(limit - mean) / sd) + special.ndtr(-(limit + mean) / sd))

@@ -16,7 +16,7 @@ sensitive to their errors; the size of these is stored beside them, and limits a
 """
 
 from collections.abc import Sequence
-from math import inf, nan
+from math import inf, nan, sqrt
 from typing import Any
 
 import msgspec
@@ -27,19 +27,13 @@ from reactorwatch.arrays import Array
 from reactorwatch.codegen.numba_kernel import Entry, jit
 
 LARGEST_ORDER = 6
-ROWS_A_COEFFICIENT = 10
-"""Smallest number of rows for each coefficient."""
+"""Largest number of coefficients: a filter has room for so many past values."""
 
 BATCHES = 10
 """Number of batches over which the squares of a training are averaged: longer than their correlation."""
 
-BLOCK, FEWEST_BLOCKS = 50, 8
-"""Rows of a block, and the smallest number of blocks, for comparing variances."""
-
-UNLIKE = 2.0
-"""Ratio of the blocks' variance to its expected value beyond which they differ."""
-
-WORST = 0.95
+BLOCK = 50
+"""Rows of a block whose variance is compared with that of others."""
 
 LARGEST_SUM = 0.98
 """Largest sum of the coefficients. Nearer to 1 the residual is a random walk, and no shift would be detected."""
@@ -82,7 +76,7 @@ def learn(z: Array, smallest_sd: float) -> Prewhitening:
         smallest_sd: lower bound of sigma.
     """
     known = int(np.count_nonzero(np.isfinite(z)))
-    largest = min(LARGEST_ORDER, known // ROWS_A_COEFFICIENT - 1)
+    largest = min(LARGEST_ORDER, known // 10 - 1)
     fits = []
     if largest >= 1:
         lagged = np.column_stack([z[largest - lag : z.size - lag] for lag in range(largest + 1)])
@@ -130,18 +124,18 @@ def _worst_block(error: Array) -> float:
     """Ratio of the worst block's standard deviation to the overall one; 1 if the blocks do not differ.
 
     The fit of a linear model of a nonlinear plant varies with the operating point, and the worst fit makes the false
-    alarms. So where blocks of rows differ significantly, sigma is that of the worst of them.
+    alarms. So where blocks of rows differ significantly, sigma is that of the worst of them (the largest of twenty).
     """
     blocks = error[: error.size // BLOCK * BLOCK].reshape(-1, BLOCK)
     size = np.sqrt(np.mean(error**2)) if error.size else 0.0
-    if len(blocks) < FEWEST_BLOCKS or size <= 0.0:
+    if len(blocks) < 8 or size <= 0.0:
         return 1.0
     sizes = np.sqrt(np.mean(blocks**2, axis=1)) / size
     fourth = float(np.mean(error**4)) / size**4
     expected_variance = max(fourth - 1.0, 1.0) / (4.0 * BLOCK)
-    if float(np.var(sizes, ddof=1)) <= UNLIKE * expected_variance:
+    if float(np.var(sizes, ddof=1)) <= 2.0 * expected_variance:
         return 1.0
-    return max(float(np.quantile(sizes, WORST)), 1.0)
+    return max(float(np.quantile(sizes, 0.95)), 1.0)
 
 
 def _sd_variance(error: Array, freedom: int) -> float:
@@ -161,6 +155,29 @@ def _sd_variance(error: Array, freedom: int) -> float:
         return independent
     batches = squares[: size * BATCHES].reshape(BATCHES, size).mean(axis=1)
     return max(independent, float(batches.var(ddof=1)) / (4.0 * mean**2 * BATCHES))
+
+
+def memory_sds(e: Array, weight: float) -> tuple[float, ...]:
+    """Standard deviation of each signal that charts with a memory use; 1 if its residual is white.
+
+    An autoregression of few coefficients may miss a correlation over many rows. It shows in averages: theirs should
+    have the variance weight / (2 - weight). Where it is larger by more than chance allows, limits follow it.
+
+    Args:
+        e: prewhitened residuals, shape (rows, signals); NaN where there is none.
+        weight: weight of the newest row in the averages.
+    """
+    sds = []
+    for column in e.T:
+        column = column[np.isfinite(column)]
+        average, squares = 0.0, 0.0
+        for value in column.tolist():
+            average += weight * (value - average)
+            squares += average * average
+        ratio = squares / max(len(column), 1) * (2.0 - weight) / weight
+        independent = max(len(column) * weight / 2.0, 1.0)
+        sds.append(sqrt(ratio) if ratio > 1.0 + 3.0 * sqrt(2.0 / independent) else 1.0)
+    return tuple(sds)
 
 
 WHITENER = np.dtype(
@@ -196,6 +213,15 @@ def expected_value(p: Any) -> float:
 
 
 @jit
+def add_past(p: Any, z: float) -> None:
+    """Add a value to the past ones."""
+    for k in range(LARGEST_ORDER - 1, 0, -1):
+        p.past[k] = p.past[k - 1]
+    p.past[0] = z
+    p.count = min(p.count + 1, max(p.order, 1))
+
+
+@jit
 def innovation(p: Any, z: float) -> float:
     """Innovation of the next value in units of sigma; NaN for NaN, which clears the past, and for too few values."""
     if not abs(z) < inf:
@@ -203,10 +229,7 @@ def innovation(p: Any, z: float) -> float:
         return nan
     is_known = p.count >= p.order
     p.expected = expected_value(p)
-    for k in range(LARGEST_ORDER - 1, 0, -1):
-        p.past[k] = p.past[k - 1]
-    p.past[0] = z
-    p.count = min(p.count + 1, max(p.order, 1))
+    add_past(p, z)
     return float((z - p.expected) / p.sd) if is_known else nan
 
 

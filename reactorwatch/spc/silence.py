@@ -56,13 +56,6 @@ UNKNOWN_ROWS = 100.0
 """Usual spacings of the plant's rows within which every signal must have a value. An analyser may give one value in
 fifty rows; a signal without a value in these is not published, or its sensor has failed."""
 
-DEVIATIONS = 2.0
-"""Mean deviations between the mean and the usual spacing."""
-
-BURST = 0.125
-"""Share of the mean spacing: a sooner sample belongs to a burst. After a partition, or a stall of this process,
-all delayed samples arrive at once, and their spacing is not learned."""
-
 LATE_NS = 1_000_000_000
 """If the check itself runs this late, the monitor was stalled; restart the timer instead of raising the alarm."""
 
@@ -131,7 +124,7 @@ def allowed_ns(s: Any, limit: float) -> int:
     """`limit` times the usual spacing; -1 before it is known."""
     if s.count < LEARN_FROM:
         return -1
-    return int(min(limit * (s.mean_ns + DEVIATIONS * s.deviation_ns), float(LONGEST_NS)))
+    return int(min(limit * (s.mean_ns + 2.0 * s.deviation_ns), float(LONGEST_NS)))
 
 
 @jit
@@ -285,11 +278,15 @@ class DataTimeout:
         self.received_ns, self.counted_ns = now_ns, None
 
     def on_receipt(self, now_ns: int) -> None:
-        """Restart the timer: a sample was received. A step back of the clock is no spacing, nor is one in a burst."""
+        """Restart the timer: a sample was received. A step back of the clock is no spacing, nor is one in a burst.
+
+        A sample sooner than an eighth of the mean spacing belongs to a burst: after a partition, or a stall of this
+        process, all delayed samples arrive at once.
+        """
         before_ns, self.received_ns = self.counted_ns, now_ns
         if before_ns is None or now_ns < before_ns:
             self.counted_ns = now_ns
-        elif self.memory.receipts.count < MEMORY or now_ns - before_ns >= BURST * self.memory.receipts.mean_ns:
+        elif self.memory.receipts.count < MEMORY or now_ns - before_ns >= 0.125 * self.memory.receipts.mean_ns:
             self.counted_ns = now_ns
             allowed = self._timeout_ns()
             spacing_ns = now_ns - before_ns

@@ -16,7 +16,8 @@ falls below it.
 
 While an alarm without a known cause is active, a fault may have moved the residual permanently, and values about its
 new level are no spikes. So a value is then compared with the median of recent ones, in units of their median deviation
-with a margin (but no less than before), and nothing is a spike before there are `LEAST_RECENT` of them.
+with a margin of three standard errors (but no less than before), and nothing is a spike before there are `LEAST_RECENT`
+of them.
 
 Every spike has its own value beyond the limit, so the rate of false spikes is never more than P(|z| > limit); that
 bound holds for dependent values as well. Where tails are heavier than normal, `spike_limit` learns a limit from the
@@ -53,30 +54,17 @@ from reactorwatch.errors import InputError, positive
 from reactorwatch.spc.charts.base import LARGEST_VALUE, finite
 from reactorwatch.stored_state import Memory
 
-NORMAL = 0.5
-"""Share of the limit within which a value is normal."""
-
 RECENT, LEAST_RECENT = 100, 10
 """Recent values with which a value is compared while an alarm is active, at most and at least."""
 
-ERRORS = 3.0
-"""Standard errors, each about 1 / sqrt(n), by which the spread of these values is taken larger than estimated."""
-
-TAIL_SHARE = 0.05
 LEAST_TAIL = 10
-"""Share of the training's largest values from which its tail is estimated, and their least number."""
-
-SEEN_SHARE = 0.75
-"""Share of these, the smaller ones, whose size counts; the others count as larger."""
+"""Least number of the training's largest values, a twentieth, from which its tail is estimated."""
 
 FEWEST_ROWS = 5 * LEAST_TAIL
+"""Fewest residuals of a training: a fifth of them is then its tail."""
 
 RATE_SHARE = 0.5
 """Length of the window in which spikes are counted, in lengths of the training."""
-
-MOST_SPIKES = 10_000
-
-_TO_SD = 1.4826  # of the median absolute deviation, for normal values
 
 Phase: TypeAlias = Literal["ordinary", "quarantined", "quarantined again", "changed"]
 
@@ -206,8 +194,8 @@ class Spike(Memory):
         if len(recent) >= LEAST_RECENT:
             level = median(recent)
             deviation = median(abs(value - level) for value in recent)
-            margin = 1.0 + ERRORS / sqrt(len(recent))
-            spread = max(1.0, margin * _TO_SD * deviation)
+            # 1.4826: from the median absolute deviation to the standard one; its error is about 1 / sqrt(n).
+            spread = max(1.0, (1.0 + 3.0 / sqrt(len(recent))) * 1.4826 * deviation)
         elif is_decided:
             self._remember(finite(z))
             self.phase, self.quarantined = "changed", 0.0
@@ -227,7 +215,7 @@ class Spike(Memory):
             return NO_SPIKE
         if not abs(z) < LARGEST_VALUE:
             finite(z)
-        beyond, normal = abs(z) > self.limit, abs(z) <= NORMAL * self.limit
+        beyond, normal = abs(z) > self.limit, abs(z) <= 0.5 * self.limit
         before, self.quarantined = self.quarantined, 0.0
         if self.phase in ("ordinary", "changed"):
             if self.phase == "changed" and not normal:
@@ -308,9 +296,9 @@ def spike_limit(z: ArrayLike, arl0: float) -> float:
     sizes = np.sort(np.abs(np.asarray(z, dtype=np.float64)))
     if sizes.ndim != 1 or sizes.size < FEWEST_ROWS or not np.isfinite(sizes).all():
         raise InputError(f"z must be at least {FEWEST_ROWS} finite values in a row, got {sizes.size}")
-    tail = max(ceil(TAIL_SHARE * sizes.size), LEAST_TAIL)
+    tail = max(ceil(0.05 * sizes.size), LEAST_TAIL)
     threshold = float(sizes[-tail - 1])
-    seen = int(SEEN_SHARE * tail)
+    seen = int(0.75 * tail)
     excess = sizes[-tail:][:seen] - threshold
     scale = float(excess.sum() + (tail - seen) * excess[-1]) / seen
     learned = threshold + scale * (1.0 + 1.0 / sqrt(seen)) * max(0.0, log(arl0 * tail / sizes.size))
@@ -332,8 +320,9 @@ def spike_count_limit(count: int, rows: int, window: int, arl0: float) -> int:
     if not count:
         return 1
     rate, share = (count + 1) / rows, rows / (rows + window)
-    for others in range(MOST_SPIKES):
+    most = 10_000
+    for others in range(most):
         # nbdtrc(k, n, p): probability of more than k
         if rate * (float(nbdtrc(others - 1, count + 1, share)) if others else 1.0) <= 1.0 / arl0:
             return others + 1
-    return MOST_SPIKES
+    return most

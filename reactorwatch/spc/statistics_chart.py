@@ -7,8 +7,8 @@ autoregression is learned. It gives the variance of their exponentially weighted
 limit, as they do for charts of residuals (`false_alarm_budget`). The chart plots the largest of the averages, in
 standard deviations.
 
-Two bounds change nothing in sound rows: a cube root counts at most `OUTLIER` standard deviations, so one wild row
-is no lasting change; an average stays below `RELEASE` limits, so the alarm of a large change ends soon after it.
+Two bounds change nothing in sound rows: a cube root counts at most six standard deviations, so one wild row
+is no lasting change; an average stays below 1.25 limits, so the alarm of a large change ends soon after it.
 """
 
 from abc import abstractmethod
@@ -21,30 +21,26 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import special
 
+from reactorwatch.arrays import Array
 from reactorwatch.errors import positive
-from reactorwatch.spc.charts.base import Array, Judgement, vector
-from reactorwatch.spc.charts.residual_space import BLOCKS, adjustment, average_rows, fill_missing
-from reactorwatch.spc.false_alarm_budget import degrees_of_freedom
+from reactorwatch.spc.charts.base import Judgement, vector
+from reactorwatch.spc.charts.ewma import ewma_limit
+from reactorwatch.spc.false_alarm_budget import TrainingErrors, degrees_of_freedom, student_tail
 from reactorwatch.spc.prewhitening import Prewhitening, learn
-from reactorwatch.spc.run_length.control_limits import ewma_limit
-from reactorwatch.spc.training_errors import TrainingErrors, student_tail
-from reactorwatch.spc.value_chart import ValueBaseline, ValueChart, student_limit
+from reactorwatch.spc.value_chart import (
+    BLOCKS,
+    NAMED,
+    ValueBaseline,
+    ValueChart,
+    adjustment,
+    average_rows,
+    fill_missing,
+    student_limit,
+)
 from reactorwatch.stored_state import Memory
 
-OUTLIER = 6.0
-"""Largest deviation of a row's cube root that counts, in standard deviations."""
-
-RELEASE = 1.25
-"""Largest average, in limits."""
-
-RESPONSE = 20.0
-"""Length of the average's impulse response in units of its memory."""
-
-SUSPICIOUS = 0.5
-"""Share of the limit from which on the parts of the signals are summed."""
-
-NAMED = 3
-"""Signals that the text of an alarm names."""
+EXPLAINED = 0.9
+"""Share of the variance that principal components have, and of the squared canonical correlations a state."""
 
 Model: TypeAlias = dict[str, Array]
 """Arrays of a model, by name."""
@@ -261,10 +257,10 @@ class StatisticsChart(ValueChart):
         memory.before = window[max(len(window) - self.rows_before, 0) :]
         if len(window) > self.rows_before:
             off = np.cbrt(self.statistics(self.model, window)) - self.model["root_means"]
-            off = np.minimum(off, OUTLIER * self.model["root_sds"]) / self.model["average_sds"]
+            off = np.minimum(off, 6.0 * self.model["root_sds"]) / self.model["average_sds"]
             averages = (1.0 - self.weight) * memory.averages + self.weight * off
-            memory.averages = np.minimum(averages, RELEASE * self.limit)
-            if memory.averages.max() > SUSPICIOUS * self.limit:
+            memory.averages = np.minimum(averages, 1.25 * self.limit)
+            if memory.averages.max() > 0.5 * self.limit:  # from there on it may be an alarm, which names the signals
                 parts = self.parts(self.model, window) - self.model["usual_parts"]
                 memory.parts = (1.0 - self.weight) * memory.parts + self.weight * parts
             else:
@@ -327,9 +323,52 @@ def average_variance(learned: Prewhitening, weight: float) -> float:
         weight: lambda, of the newest value.
     """
     response, past, average, total = 1.0, [0.0] * len(learned.coefficients), 0.0, 0.0
-    for _ in range(int(RESPONSE / weight * max(1.0, 1.0 / learned.shift_gain))):
+    # Twenty memories: what comes after is below rounding.
+    for _ in range(int(20.0 / weight * max(1.0, 1.0 / learned.shift_gain))):
         average = (1.0 - weight) * average + weight * response
         total += average**2
         past = [response, *past[:-1]] if past else []
         response = sum(a * value for a, value in zip(learned.coefficients, past, strict=True))
     return learned.sd**2 * total
+
+
+# --- principal components ----------------------------------------------------------------------------------------
+
+
+class Components(NamedTuple):
+    """Components of centred signals.
+
+    Attributes:
+        loadings: orthonormal directions, shape (signals, components).
+        variances: variance of each component.
+        rest: variance that they leave, of all signals together.
+    """
+
+    loadings: Array
+    variances: Array
+    rest: float
+
+
+def components_of(covariance: Array) -> Components:
+    """The fewest components that explain `EXPLAINED` of the variance; at least one direction is left."""
+    values, vectors = np.linalg.eigh(covariance)
+    values, vectors = np.maximum(values[::-1], 0.0), vectors[:, ::-1]
+    shares = np.cumsum(values) / values.sum()
+    count = min(int(np.searchsorted(shares, EXPLAINED) + 1), len(values) - 1)
+    rest = max(float(values[count:].sum()), 1e-12 * float(values.sum()))
+    return Components(np.ascontiguousarray(vectors[:, :count]), values[:count], rest)
+
+
+def parts_of(off: Array, loadings: Array, variances: Array, rest: float) -> Array:
+    """Each signal's part of T2 and of SPE, shape (2, signals); in sound rows both have the mean 1.
+
+    Args:
+        off: deviations of the signals of a row, shape (signals,).
+        loadings: see `Components`; directions without variance add nothing.
+        variances: see `Components`.
+        rest: see `Components`.
+    """
+    scores = off @ loadings
+    used = variances > 0.0
+    weighted = np.where(used, scores / np.where(used, variances, 1.0), 0.0) / max(int(used.sum()), 1)
+    return np.array([off * (loadings @ weighted), (off - loadings @ scores) ** 2 / rest])

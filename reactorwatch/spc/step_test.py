@@ -29,12 +29,13 @@ from scipy.special import ndtri
 
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.numba_kernel import Entry, jit
-from reactorwatch.spc import false_alarm_budget
+from reactorwatch.spc.false_alarm_budget import widen_limit
 from reactorwatch.spc.prewhitening import (
     LARGEST_ORDER,
     WHITENER,
     Prewhitener,
     Prewhitening,
+    add_past,
     expected_value,
 )
 
@@ -49,9 +50,6 @@ HYPOTHESES = ONSETS - FEWEST_LATER
 
 ROWS = ONSETS + LARGEST_ORDER
 """Rows that may have the outlier: the response to one goes on after it."""
-
-FEWEST_PEAKS = 5
-"""Fewest peaks of the training's statistics from which their tail is estimated."""
 
 STEP_TEST = np.dtype(
     [
@@ -88,19 +86,8 @@ class StepPoint(NamedTuple):
 def _innovation(p: Any, z: float) -> float:
     """Innovation of a residual; one after a missing residual is taken about the mean."""
     w = p.whitener
-    if w.count < w.order:
-        centre = w.constant
-        total = 0.0
-        for k in range(w.order):
-            total += w.coefficients[k]
-        centre /= 1.0 - total
-        e = (z - centre) / p.marginal_sd
-    else:
-        e = (z - expected_value(w)) / w.sd
-    for k in range(LARGEST_ORDER - 1, 0, -1):
-        w.past[k] = w.past[k - 1]
-    w.past[0] = z
-    w.count = min(w.count + 1, max(w.order, 1))
+    e = (z - expected_value(w)) / (w.sd if w.count >= w.order else p.marginal_sd)
+    add_past(w, z)
     return float(e)
 
 
@@ -189,7 +176,10 @@ class StepTests:
             p["response"] = np.nan_to_num(step_response(response, item))
             p["recent"] = nan
         tests = cls(numbers)
-        statistics = np.array([tests._update(row) for row in z]).reshape(z.shape)
+        statistics = np.empty(z.shape)
+        for row, values in enumerate(z.tolist()):
+            tests.update(values)
+            statistics[row] = tests._statistics
         for i, item in enumerate(learned):
             numbers[i]["limit"] = design_limit(statistics[:, i], item, arl0)
         tests.restart()
@@ -207,10 +197,6 @@ class StepTests:
             z: residual of each signal; NaN where there is none.
         """
         return bool(_UPDATE.call(self.numbers, np.array(z), self._statistics))
-
-    def _update(self, z: Array) -> Array:
-        _UPDATE.call(self.numbers, np.ascontiguousarray(z), self._statistics)
-        return self._statistics.copy()
 
     def sensitivity(self, signal: int) -> float:
         """Statistic after a lasting step of one unit of a signal, without noise: what no outlier explains of it."""
@@ -254,11 +240,11 @@ def design_limit(statistics: Array, learned: Prewhitening, arl0: float) -> float
         learned: prewhitening of the residual.
         arl0: run length without a fault, in rows.
     """
-    normal = false_alarm_budget.widen_limit(-float(ndtri(0.5 / (arl0 * HYPOTHESES))), 1.0, learned)
+    normal = widen_limit(-float(ndtri(0.5 / (arl0 * HYPOTHESES))), 1.0, learned)
     blocks = np.array_split(np.nan_to_num(statistics) ** 2, max(statistics.size // ONSETS, 1))
     largest = np.sort([float(block.max()) for block in blocks if block.size])
     upper = len(largest) // 2
-    if upper < FEWEST_PEAKS:
+    if upper < 5:  # too few for an estimate of their tail
         return normal
     threshold, excess = largest[-upper - 1], largest[-upper:] - largest[-upper - 1]
     scale = float(excess.mean()) * (1.0 + 1.0 / sqrt(upper))

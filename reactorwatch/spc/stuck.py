@@ -45,12 +45,6 @@ from reactorwatch.stored_state import Memory, Records, place_records
 SMALLEST = 5
 """Fewer equal readings in a row than this are never a fault."""
 
-ENOUGH_RUNS = 5
-"""Least number of runs at a depth for an estimate of their continuation."""
-
-MARGIN = 2
-"""Least limit, in longest runs of the training."""
-
 MOVEMENT_STEPS = 8
 """Steps in the mean that shows whether the signal was moving."""
 
@@ -58,6 +52,7 @@ AT_REST = 0.25
 """Share of the mean step in the quietest interval of the training: with less, the plant was coming to rest."""
 
 CONFIDENCE = 0.95
+"""Confidence of the bounds on shares."""
 
 STUCK = np.dtype(
     [
@@ -264,12 +259,12 @@ def longest_ordinary_run(runs: dict[int, int], arl0: float) -> float:
     longest = max(runs)
     repeated = sum(count * repeats for repeats, count in runs.items())
     independent = _length(upper_bound(repeated, readings - 1, CONFIDENCE), arl0)
-    limits = [SMALLEST - 1.0, MARGIN * (longest + 1.0), independent]
+    limits = [SMALLEST - 1.0, 2 * (longest + 1.0), independent]
     depth = 1
     while depth <= longest:
         deep = {repeats: count for repeats, count in runs.items() if repeats >= depth}
         reached = sum(deep.values())
-        if reached < ENOUGH_RUNS:
+        if reached < 5:  # too few for an estimate of their continuation
             break
         continued = sum(count * (repeats - depth) for repeats, count in deep.items())
         # Two bounds that hold together with the confidence of one (Bonferroni).

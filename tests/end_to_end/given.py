@@ -11,10 +11,10 @@ import numpy as np
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from reactorwatch.process.fault import parse_fault
-from reactorwatch.process.library.cascaded_tanks.effects import TANK_EFFECTS
-from reactorwatch.process.library.cascaded_tanks.model import tanks
-from reactorwatch.process.library.three_tanks.effects import THREE_TANKS_EFFECTS
-from reactorwatch.process.library.three_tanks.model import three_tanks
+from reactorwatch.process.library.cascaded_tanks import EFFECTS as TANK_EFFECTS
+from reactorwatch.process.library.cascaded_tanks import tanks
+from reactorwatch.process.library.three_tanks import EFFECTS as THREE_TANKS_EFFECTS
+from reactorwatch.process.library.three_tanks import three_tanks
 from reactorwatch.process.simulate import Simulator
 from reactorwatch.records.record import Record
 from reactorwatch.records.write import write_table

@@ -13,7 +13,7 @@ from plant_node.record import simulate_record
 from reactorwatch.diagnosis.diagnose import diagnose
 from reactorwatch.diagnosis.result import Diagnosis
 from reactorwatch.process.fault import parse_fault
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import cstr
 from reactorwatch.records.record import Record
 from reactorwatch.records.write import write_table
 from tests.tables import read_csv

@@ -7,8 +7,7 @@ from pathlib import Path
 import pytest
 
 from reactorwatch.diagnosis.report.page import as_page
-from reactorwatch.process.library.cstr.effects import EFFECTS
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import EFFECTS, cstr
 from tests.unit.diagnosis.cases import CASES
 
 from .browser import Browser, browser

@@ -7,8 +7,7 @@ that, or where the reactor starts to leave its branch.
 
 from dataclasses import dataclass
 
-from reactorwatch.process.library.cstr.effects import EFFECTS
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import EFFECTS, cstr
 from tests.hidden_effect import reactor
 
 BOTH, UP, DOWN = (1.0, -1.0), (1.0,), (-1.0,)

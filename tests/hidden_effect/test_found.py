@@ -13,8 +13,7 @@ from scipy.stats import binom
 
 from reactorwatch.diagnosis.diagnose import diagnose
 from reactorwatch.diagnosis.result import NOMINAL, Diagnosis
-from reactorwatch.process.library.cstr.effects import EFFECTS
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import EFFECTS, cstr
 from tests.hidden_effect.catalogue import named
 from tests.hidden_effect.draw import Hidden, draw
 from tests.hidden_effect.excitation import NAMED_CIRCUMSTANCES

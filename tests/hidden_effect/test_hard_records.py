@@ -7,7 +7,7 @@ import pytest
 
 from reactorwatch.diagnosis.diagnose import diagnose
 from reactorwatch.diagnosis.result import NOMINAL, Diagnosis
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import cstr
 from tests.hidden_effect.catalogue import named
 from tests.hidden_effect.draw import Hidden, draw
 from tests.hidden_effect.excitation import NAMED_CIRCUMSTANCES, Circumstances

@@ -11,8 +11,7 @@ from reactorwatch.diagnosis.fitting.fault_filter import FaultFilter
 from reactorwatch.diagnosis.fitting.hypothesis import Hypothesis
 from reactorwatch.diagnosis.fitting.profiles import Constant
 from reactorwatch.diagnosis.record_checks import make_run
-from reactorwatch.process.library.cstr.effects import EFFECTS
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import EFFECTS, cstr
 from tests.hidden_effect.catalogue import HiddenEffect, named
 from tests.hidden_effect.draw import draw
 from tests.hidden_effect.excitation import NAMED_CIRCUMSTANCES

@@ -10,7 +10,7 @@ import pytest
 
 from reactorwatch.diagnosis.diagnose import diagnose
 from reactorwatch.diagnosis.result import UNKNOWN
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import cstr
 from tests.hidden_effect.catalogue import OUTSIDE
 from tests.hidden_effect.draw import draw
 from tests.hidden_effect.excitation import NAMED_CIRCUMSTANCES

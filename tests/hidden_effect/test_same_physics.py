@@ -8,8 +8,7 @@ from reactorwatch.diagnosis.fitting.fault_filter import FaultFilter
 from reactorwatch.diagnosis.fitting.profiles import Step
 from reactorwatch.diagnosis.run import Run
 from reactorwatch.process.effect import Effect
-from reactorwatch.process.library.cstr.effects import EFFECTS
-from reactorwatch.process.library.cstr.model import OPERATING_COOLANT_FLOW, cstr
+from reactorwatch.process.library.cstr import EFFECTS, OPERATING_COOLANT_FLOW, cstr
 from reactorwatch.process.profiles import CONSTANT, STEP, Profile
 from reactorwatch.process.simulate import Simulator
 from reactorwatch.process.steady_state import steady_states

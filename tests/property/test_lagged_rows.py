@@ -5,7 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from monitor_node.learn.arx import LaggedRows
-from reactorwatch.identification.regressor import rows_of
+from reactorwatch.identification.data import rows_of
 from reactorwatch.identification.structure import Structure
 
 PERIOD_NS = 100

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from reactorwatch.errors import InputError
 from reactorwatch.process.fault import FaultSpecification, parse_fault
-from reactorwatch.process.library.cstr.effects import EFFECTS
+from reactorwatch.process.library.cstr import EFFECTS
 from reactorwatch.process.profiles import FREE, PROFILES, free_profile
 
 

@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from reactorwatch.process.library.cstr.model import OPERATING_STATE, cstr
+from reactorwatch.process.library.cstr import OPERATING_STATE, cstr
 from reactorwatch.process.simulate import Simulator
 
 SIMULATOR = Simulator(cstr())

@@ -12,22 +12,18 @@ import numpy as np
 import pytest
 
 import monitor_node.checks
-import reactorwatch.process.library.cstr.effects
 import reactorwatch.spc.charts
 import recorder.panels
 from monitor_node.checks.stage import CHECKS
 from monitor_node.config import CHART_SIGNALS, MonitorConfig
 from monitor_node.watch import row_frame, row_step
+from reactorwatch.process import EFFECTS_OF
 from reactorwatch.spc.charts.catalogue import CHARTS
 from tests.unit.monitor_node.samples import leaking_run
 
 ROOT = Path(__file__).parents[2]
 
 FAMILIES = {
-    "effects": (
-        reactorwatch.process.library.cstr.effects,
-        {type(e).__module__ for e in reactorwatch.process.library.cstr.effects.EFFECTS},
-    ),
     "charts": (reactorwatch.spc.charts, {chart.__module__ for chart in CHARTS}),
     "checks": (monitor_node.checks, {check.__module__ for check in CHECKS}),
     "panels": (recorder.panels, {panel.draw.__module__ for panel in recorder.panels.PANELS}),
@@ -49,7 +45,7 @@ def test_every_file_of_the_folder_is_listed(family: str) -> None:
 
 def test_names_in_a_catalogue_differ() -> None:
     for names in (
-        [effect.name for effect in reactorwatch.process.library.cstr.effects.EFFECTS],
+        *([effect.name for effect in effects] for effects in EFFECTS_OF.values()),
         [*(kind.name for kind in CHARTS), *(check.name for check in CHECKS)],  # in the names of alarms
         [panel.title for panel in recorder.panels.PANELS],
     ):
@@ -82,11 +78,7 @@ def sources(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("sources")
     for package in ("reactorwatch", "plant_node", "monitor_node", "recorder", "diagnosis_node"):
         shutil.copytree(ROOT / package, folder / package)  # with what Numba has compiled
-    charts, checks, effects = (
-        "reactorwatch/spc/charts",
-        "monitor_node/checks",
-        "reactorwatch/process/library/cstr/effects",
-    )
+    charts, checks, plants = "reactorwatch/spc/charts", "monitor_node/checks", "reactorwatch/process/library"
     add(
         folder,
         f"{charts}/moving_range.py",
@@ -105,8 +97,16 @@ def sources(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "JumpCheck",
         ")",
     )
-    effect = example("Add an effect").partition("\n\n\nslower = ")[0]
-    add(folder, f"{effects}/heat_capacity.py", effect, f"{effects}/__init__.py", "HeatCapacity", "HeatCapacity()", ")")
+    effect = example("Add an effect").partition("\n\n\nfrom ")[0] + "\n"
+    add(
+        folder,
+        f"{plants}/heat_capacity.py",
+        effect,
+        f"{plants}/cstr.py",
+        "HeatCapacity",
+        "HeatCapacity()",
+        ")\n# fmt: on",
+    )
     return folder
 
 

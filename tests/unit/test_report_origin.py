@@ -5,8 +5,7 @@ from pathlib import Path
 
 from reactorwatch.api.report_origin import report_origin
 from reactorwatch.diagnosis.report.page import as_page
-from reactorwatch.process.library.cstr.effects import EFFECTS
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import EFFECTS, cstr
 from reactorwatch.version import this_build
 from tests.unit.diagnosis.cases import CASES
 

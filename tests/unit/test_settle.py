@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import reactorwatch as rw
-from reactorwatch.process.library.cascaded_tanks.model import tanks
+from reactorwatch.process.library.cascaded_tanks import tanks
 from reactorwatch.process.simulate import Simulator
 from tests.running import Command
 

@@ -35,9 +35,8 @@ from reactorwatch.diagnosis.fitting.profiles import Constant, FittedProfile, Lat
 from reactorwatch.diagnosis.result import LISTED
 from reactorwatch.diagnosis.run import Run
 from reactorwatch.diagnosis.search.search import FittedHypothesis
-from reactorwatch.process.integrate import SimulationError
 from reactorwatch.process.model import ProcessModel
-from reactorwatch.process.simulate import Simulator, Trajectory
+from reactorwatch.process.simulate import SimulationError, Simulator, Trajectory
 
 REFINED_STEPS = 1
 """Steps of a fit: the first takes the linear solution to the nonlinear equations."""

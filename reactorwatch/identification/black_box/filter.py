@@ -30,32 +30,16 @@ from numpy.typing import NDArray
 
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.numba_kernel import Entry, jit
-from reactorwatch.identification.black_box.model import BlackBoxModel
-from reactorwatch.identification.black_box.state_map import predict_outputs
+from reactorwatch.identification.black_box.model import BlackBoxModel, predict_outputs
 from reactorwatch.stored_state import Memory
 
-UNSEEN = 1.3
-"""Ratio of the standard deviation of an innovation to that of the training beyond which a row is an extrapolation."""
-
-SETTLED = 25
-"""Rows in succession that are no extrapolation after which the values of the inputs are familiar."""
-
-LARGEST_PREDICTION = 1e12
-"""Size of the scaled predictions, and of their standard deviations, where the model diverges, so that the charts can
-use them until it starts again."""
-
-BINS, BIN_WIDTH = 64, 0.25
-"""Intervals of the values of an input that are familiar or not, and their width in its standard deviations."""
-
-FLAGS = 3
-"""Numbers at the start of a belief: learning flag, flag of unfamiliar inputs, rows since they settled."""
-
-MEMORY = 10_000
-"""Rows after which a row is forgotten."""
-
-HEAD = 7
-"""Numbers before the arrays in the constants: outputs, inputs, lags, delay, terms, degree, rate of forgetting."""
-
+UNSEEN = 1.3  # times the standard deviation of the training's innovations: more is an extrapolation
+SETTLED = 25  # rows in succession that are no extrapolation, after which the values of the inputs are familiar
+LARGEST_PREDICTION = 1e12  # of scaled signals, and of their sd, where the model diverges: the charts can still use them
+BINS, BIN_WIDTH = 64, 0.25  # intervals of the values of an input, and their width in its standard deviations
+MEMORY = 10_000  # rows after which a row is forgotten
+FLAGS = 3  # numbers at the start of a belief: learning flag, flag of unfamiliar inputs, rows since they settled
+HEAD = 7  # numbers at the start of the constants: outputs, inputs, lags, delay, terms, degree, rate of forgetting
 FAILED, UNJUDGED, JUDGED = -1.0, 0.0, 1.0
 
 

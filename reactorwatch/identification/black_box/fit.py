@@ -8,7 +8,7 @@
    posterior covariance says which are known.
 3. The variances of process and measurements maximise the likelihood of the filter (`log_likelihood`).
 4. The number of lags is that of the largest likelihood less half the effective parameters times the logarithm of the
-   rows (Schwarz, Ann. Statist. 6 (1978) 461). Then `FINEST_DEGREE` is tried by Akaike's criterion, with a margin.
+   rows (Schwarz, Ann. Statist. 6 (1978) 461). Then one degree more is tried by Akaike's criterion, with a margin.
 """
 
 from dataclasses import dataclass, replace
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from reactorwatch.arrays import Array
 from reactorwatch.errors import InputError
-from reactorwatch.identification.black_box.model import BlackBoxModel
+from reactorwatch.identification.black_box.model import BlackBoxModel, Shape, lagged_inputs
 from reactorwatch.identification.black_box.prediction_error import (
     NEXT,
     START,
@@ -26,35 +26,14 @@ from reactorwatch.identification.black_box.prediction_error import (
     log_likelihood,
     prediction_errors,
 )
-from reactorwatch.identification.black_box.state_map import Shape, lagged_inputs
 
-MOST_PARAMETERS = 90
-"""Parameters of all outputs; the filter's work grows with their square."""
-
-LARGEST_DEGREE, MOST_LAGS = 3, 3
-
-FINEST_DEGREE = 4
-"""Degree that is taken where it is likelier: with little noise a cubic is visibly wrong."""
-
-ROWS_A_PARAMETER = 4
-"""Least number of measured values for each parameter."""
-
-PRIOR_SD = (1.0, 1.0, 0.17, 0.07, 0.03)
-"""Standard deviations of the parameters by degree, of scaled signals."""
-
+MOST_PARAMETERS = 90  # of all outputs; the filter's work grows with their square
+LARGEST_DEGREE = 3  # one more where that is likelier: with little noise a cubic is visibly wrong
+ROWS_A_PARAMETER = 4  # least number of measured values for each parameter
+PRIOR_SD = (1.0, 1.0, 0.17, 0.07, 0.03)  # of the parameters by degree, of scaled signals
 GAINS = (1.0, 0.6, 0.3, 0.1, 0.03, 0.0)
-MARGIN = 10.0
-"""Difference of log-likelihoods that a larger gain has to bring, or the finest degree."""
-
-NOISE_MARGIN = 5.0
-"""The same for noise of the process."""
-
-_ITERATIONS, _LAST_ITERATIONS = 5, 20
-LEAST_RELATIVE_SD = 1e-6
-"""Standard deviation of the measurements, relative to the output's own, below which it is rounding."""
-
-_CONVERGED = 1e-4  # relative decrease of the cost
-_LEAST_VARIANCE = 1e-8  # of the process, relative to that of the measurements
+MARGIN = 10.0  # of log-likelihood that a larger gain or degree must bring, and half of it noise of the process
+_LEAST_VARIANCE = 1e-8  # of the process, of that of the measurements
 
 
 @dataclass(frozen=True)
@@ -94,7 +73,7 @@ def largest_shapes(outputs: int, inputs: int, rows: int, delay: int = 1) -> list
     """For each number of lags the shape of the largest degree that is small enough; empty if there is none."""
     most = min(MOST_PARAMETERS, rows * outputs // ROWS_A_PARAMETER)
     shapes = []
-    for lags in range(1, MOST_LAGS + 1):
+    for lags in range(1, 4):
         degrees = [
             degree
             for degree in range(1, LARGEST_DEGREE + 1)
@@ -123,7 +102,7 @@ def fit_black_box(
     centres, spreads = _scaling(outputs, inputs)
     count = outputs.shape[1]
     y, u = (outputs - centres[:count]) / spreads[:count], (inputs - centres[count:]) / spreads[count:]
-    smallest = np.square(np.maximum(smallest_sd / spreads[:count], LEAST_RELATIVE_SD))
+    smallest = np.square(np.maximum(smallest_sd / spreads[:count], 1e-6))  # less is rounding
     complete = int(np.isfinite(outputs).all(axis=1).sum())
 
     def fit(shape: Shape) -> tuple[float, float, BlackBoxModel] | None:
@@ -149,7 +128,7 @@ def fit_black_box(
         default=None,
     )
     if best is not None:
-        finer = replace(best[2].shape, degree=FINEST_DEGREE)
+        finer = replace(best[2].shape, degree=LARGEST_DEGREE + 1)
         other = fit(finer) if finer.parameters <= MOST_PARAMETERS else None
         if other is not None and other[0] - other[1] > best[0] - best[1] + MARGIN:
             best = other
@@ -212,14 +191,14 @@ def _fit_shape(shape: Shape, rows: Rows) -> _Fit:
 def _fit_gains(shape: Shape, rows: Rows, theta: Array, gains: tuple[float, ...]) -> _Fit:
     best: _Fit | None = None
     for gain in gains:
-        fitted = _gauss_newton(shape, rows, theta, gain, _LAST_ITERATIONS if gain == gains[-1] else _ITERATIONS)
+        fitted = _gauss_newton(shape, rows, theta, gain, 20 if gain == gains[-1] else 5)
         if fitted is None:
             continue
         theta = fitted.theta
         if best is None or fitted.likelihood > best.likelihood - MARGIN:
             best = fitted
     if best is None:  # even the start diverges: that of the gain 1 with no dynamics cannot
-        best = _gauss_newton(shape, rows, np.zeros_like(theta), 1.0, _ITERATIONS)
+        best = _gauss_newton(shape, rows, np.zeros_like(theta), 1.0, 5)
     assert best is not None
     return best
 
@@ -258,7 +237,7 @@ def _gauss_newton(shape: Shape, rows: Rows, theta: Array, gain: float, iteration
             damping = max(10.0 * damping, 1e-4)
         run(theta, weights, nothing)
         variances = _variances(errors, rows.smallest)
-        if before - after <= _CONVERGED * before:
+        if before - after <= 1e-4 * before:
             break
     run(theta, 1.0 / variances, gram)
     covariance = _inverse(gram + np.diag(precision))
@@ -306,6 +285,6 @@ def _fit_variances(shape: Shape, rows: Rows, fitted: _Fit) -> tuple[Array, Array
                     break
         if not improved:
             step *= 0.5
-    if value_without > value - NOISE_MARGIN:
+    if value_without > value - 0.5 * MARGIN:
         logs, value = without, value_without
     return np.exp(logs[:count]), np.exp(logs[count:]), value

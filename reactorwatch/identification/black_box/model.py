@@ -1,13 +1,69 @@
-"""Fitted state map: parameters with their covariance, and the variances of the plant and its measurements."""
+"""Polynomial state map x[k+1] = f(x[k], u[k]), with the newest outputs as the state, and a map that was fitted.
 
+The signals of a row are the outputs of the last `lags` rows, the newest first, then as many lagged inputs. Each output
+of the next row is a linear combination of products of these signals, up to a degree. Signals are scaled by mean and
+spread of the training.
+"""
+
+from dataclasses import dataclass
 from typing import Self
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
 from reactorwatch.arrays import Array
-from reactorwatch.identification.black_box.state_map import Shape
+from reactorwatch.codegen.numba_kernel import jit
+from reactorwatch.identification.polynomial import factors_of, products_of
 from reactorwatch.stored_state import pack_numbers, unpack_numbers
+
+
+@dataclass(frozen=True)
+class Shape:
+    """Shape of a state map.
+
+    Attributes:
+        outputs: number of outputs.
+        inputs: number of inputs.
+        lags: rows of outputs, and of inputs, on which the next row depends.
+        degree: largest number of factors of a product.
+        delay: delay of the inputs in rows; with 1 they act on the next row.
+    """
+
+    outputs: int
+    inputs: int
+    lags: int
+    degree: int
+    delay: int = 1
+
+    @property
+    def states(self) -> int:
+        """Number of states."""
+        return self.outputs * self.lags
+
+    @property
+    def signals(self) -> int:
+        """Number of factors that a product can have."""
+        return (self.outputs + self.inputs) * self.lags
+
+    @property
+    def past(self) -> int:
+        """Number of rows of which the inputs are needed."""
+        return self.lags + self.delay - 1
+
+    @property
+    def terms(self) -> int:
+        """Number of terms of an output."""
+        return len(self.products())
+
+    @property
+    def parameters(self) -> int:
+        """Number of parameters of all outputs."""
+        return self.outputs * self.terms
+
+    def products(self) -> NDArray[np.int64]:
+        """Factors of all products, see `polynomial.factors_of`."""
+        return factors_of(products_of(self.signals, self.degree))
 
 
 class BlackBoxModel(msgspec.Struct, frozen=True):
@@ -55,18 +111,7 @@ class BlackBoxModel(msgspec.Struct, frozen=True):
         theta: Array,
         covariance: Array,
     ) -> Self:
-        """Make a model of arrays.
-
-        Args:
-            shape: shape of the map.
-            rows: number of rows of the fit.
-            effective: see the attributes.
-            gain: gain of the fit.
-            scaling: centres and spreads.
-            variances: r and q.
-            theta: parameters, shape (outputs, terms).
-            covariance: shape (parameters, parameters), of the parameters.
-        """
+        """Make a model of arrays: centres and spreads, r and q, and parameters, shape (outputs, terms)."""
         lower = covariance[np.tril_indices(theta.size)]
         centres, spreads, r, q = (tuple(item.tolist()) for item in (*scaling, *variances))
         numbers = pack_numbers(np.concatenate([theta.ravel(), lower]))
@@ -115,3 +160,64 @@ class BlackBoxModel(msgspec.Struct, frozen=True):
         if numbers.size != count + count * (count + 1) // 2:
             raise ValueError(f"a model of {count} parameters must have a covariance of that size, got {numbers.size}")
         return numbers
+
+
+def lagged_inputs(shape: Shape, inputs: Array) -> Array:
+    """Inputs on which the row after each row depends, newest first, shape (rows, inputs lags); NaN where unknown."""
+    rows = len(inputs)
+    lagged = np.full((rows, shape.inputs * shape.lags), np.nan)
+    for lag in range(shape.lags):
+        shift = shape.delay - 1 + lag
+        lagged[shift:, lag * shape.inputs : (lag + 1) * shape.inputs] = inputs[: rows - shift]
+    return lagged
+
+
+@jit
+def predict_outputs(
+    theta: NDArray[np.float64],
+    signals: NDArray[np.float64],
+    products: NDArray[np.int64],
+    values: NDArray[np.float64],
+    slopes: NDArray[np.float64],
+    outputs: NDArray[np.float64],
+    jacobian: NDArray[np.float64],
+) -> None:
+    """Outputs of the next row and their derivatives by the states.
+
+    Args:
+        theta: parameters, shape (outputs, terms).
+        signals: scaled signals, the states first.
+        products: see `Shape.products`.
+        values: filled with the products, shape (terms,).
+        slopes: filled with their derivatives by the states, shape (terms, states).
+        outputs: filled, shape (outputs,).
+        jacobian: filled, shape (outputs, states).
+    """
+    terms, degree = products.shape
+    states = slopes.shape[1]
+    for term in range(terms):
+        value = 1.0
+        for i in range(degree):
+            if products[term, i] >= 0:
+                value *= signals[products[term, i]]
+        values[term] = value
+        for state in range(states):
+            slopes[term, state] = 0.0
+        for i in range(degree):
+            factor = products[term, i]
+            if 0 <= factor < states:
+                others = 1.0
+                for k in range(degree):
+                    if k != i and products[term, k] >= 0:
+                        others *= signals[products[term, k]]
+                slopes[term, factor] += others
+    for j in range(theta.shape[0]):
+        total = 0.0
+        for term in range(terms):
+            total += theta[j, term] * values[term]
+        outputs[j] = total
+        for i in range(states):
+            total = 0.0
+            for term in range(terms):
+                total += theta[j, term] * slopes[term, i]
+            jacobian[j, i] = total

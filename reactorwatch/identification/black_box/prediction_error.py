@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reactorwatch.codegen.numba_kernel import jit
-from reactorwatch.identification.black_box.state_map import predict_outputs
+from reactorwatch.identification.black_box.model import predict_outputs
 
 START, NEXT = 1, 2
 """Kinds of a row: the state is set from its measurements; it follows the row before. 0: it is left out."""
@@ -22,9 +22,6 @@ DIVERGED = 50.0
 RowArrays: TypeAlias = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]
 """Scaled outputs, shape (rows, outputs), NaN where missing; scaled lagged inputs, shape (rows, inputs lags); kinds of
 the rows, shape (rows,)."""
-
-LARGEST_SQUARE = 25.0
-"""Largest square of a normalised error in the likelihood: more are outliers."""
 
 
 @jit
@@ -43,7 +40,7 @@ def prediction_errors(
 
     Args:
         theta: parameters, shape (outputs, terms).
-        products: see `state_map.Products`.
+        products: see `model.Shape.products`.
         states: number of states.
         rows: rows of the training.
         gain: share of an error that corrects the state.
@@ -171,7 +168,7 @@ def log_likelihood(
         for j in range(outputs):
             S, error = P[j, j] + r[j], y[k, j] - signals[j]
             if abs(error) < inf:
-                total -= 0.5 * (np.log(S) + min(error * error / S, LARGEST_SQUARE))
+                total -= 0.5 * (np.log(S) + min(error * error / S, 25.0))  # more is an outlier
                 for a in range(states):
                     K[a] = P[a, j]
                 for a in range(states):

@@ -6,20 +6,27 @@ bit. A chart does not restart by itself after a point that is out: its owner cal
 """
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, NamedTuple, Self
 
+import msgspec
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.special import ndtri
 
-from reactorwatch.spc.baseline import Baseline
-from reactorwatch.spc.training_errors import TrainingErrors, relative_rate
+from reactorwatch.arrays import Array
+from reactorwatch.spc.false_alarm_budget import TrainingErrors, relative_rate
+from reactorwatch.spc.prewhitening import Prewhitening
 from reactorwatch.stored_state import Memory
-
-Array = NDArray[np.float64]
 
 LARGEST_VALUE = 1e30
 """Values at or beyond this are refused: their sums could overflow."""
+
+MOST_SIGNALS = 100
+"""Most signals of a joint chart: so many the run length without a shift is computed for."""
+
+ROWS_A_SIGNAL = 2
+"""Rows of the training that a chart of several signals needs for each: with fewer their relations are hardly known."""
 
 
 class Judgement(NamedTuple):
@@ -97,13 +104,58 @@ class Shown(NamedTuple):
             allowed: largest size within the limits; None: not shown.
             lead: words before the size, with a space behind them.
         """
-        side = "above" if judgement.statistic > judgement.centre else "below"
-        text = f"{self.name} is {lead}{format_quantity(size, self.unit)} {side} what the model expects"
+        text = f"{self.name} is {lead}{format_quantity(size, self.unit)} {judgement.side} what the model expects"
         return text if allowed is None else f"{text} (allowed: {format_quantity(allowed, self.unit)})"
 
 
+class Baseline(NamedTuple):
+    """A training of one or several signals, and how rarely a chart of their residuals may raise a false alarm.
+
+    Attributes:
+        learned: the prewhitening of each signal.
+        e: prewhitened residuals, shape (rows, signals), of the rows in which no signal is missing.
+        memory_sd: standard deviation of each signal that charts with a memory use, see `prewhitening.memory_sds`.
+        arl0: run length of the alarm without a fault, in rows.
+        point_probability: probability of a single point that is out, of a chart whose alarm takes several points.
+        settings: settings of the charts, by key.
+    """
+
+    learned: tuple[Prewhitening, ...]
+    e: Array
+    memory_sd: tuple[float, ...]
+    arl0: float
+    point_probability: float
+    settings: Mapping[str, float]
+
+    def of(self, signals: Sequence[int]) -> "Baseline":
+        """The baseline of some of the signals, by their indices."""
+        return self._replace(
+            learned=tuple(self.learned[index] for index in signals),
+            e=complete_rows(self.e, signals),
+            memory_sd=tuple(self.memory_sd[index] for index in signals),
+        )
+
+
+class Design(msgspec.Struct, frozen=True):
+    """The fastest chart of a kind for a shift, and its run lengths.
+
+    Attributes:
+        chart: name in the catalogue.
+        parameters: values by the parameter names of the run-length commands.
+        arl0: run length without a shift, in samples.
+        shift: shift to be detected, in sigma.
+        arl: run length at the shift, in samples.
+    """
+
+    chart: str
+    parameters: Mapping[str, float | int | list[int]]
+    arl0: float
+    shift: float
+    arl: float
+
+
 class Chart(ABC):
-    """A control chart: a `SignalChart`, a `JointChart`, or one of the parameters of models.
+    """A control chart: a `SignalChart`, a `JointChart`, a `ValueChart`, or one of the parameters of models.
 
     Attributes:
         name: in `[monitor] charts`, in the key of its points and in the name of its alarm.
@@ -129,6 +181,21 @@ class Chart(ABC):
             baseline: training of the chart's signals, as for its design.
         """
         return None
+
+    @classmethod
+    def fastest(cls, arl0: float, shift: float, dimension: int, rules: tuple[int, ...]) -> Design:
+        """Design the chart that detects a shift fastest at a run length; only of charts whose run length is computed.
+
+        Args:
+            arl0: run length without a shift.
+            shift: shift to be detected, in sigma.
+            dimension: number of signals, of a joint chart.
+            rules: run rules, of a Shewhart chart.
+
+        Raises:
+            InputError: no limit gives that run length.
+        """
+        raise NotImplementedError(cls.name)
 
     memory: Any
 
@@ -191,6 +258,86 @@ class SignalChart(Chart):
             signal: the signal of the chart.
         """
         return f"{signal.name} is {judgement.side} the limit of its {self.name} chart", {signal.name: 1.0}
+
+
+class JointChart(Chart):
+    """A chart of all signals together; a sample is a vector."""
+
+    @classmethod
+    @abstractmethod
+    def design(cls, baseline: Baseline) -> Self:
+        """The chart for a training; there must be no obstacle to it."""
+
+    @classmethod
+    @abstractmethod
+    def relative_rates(cls, baseline: Baseline, errors: TrainingErrors) -> Array:
+        """Rate of false alarms by the errors of the training, relative to the intended one, shape (draws,).
+
+        Of a chart without memory it is that of its single points. `T2.relative_rates` serves for any distance.
+
+        Args:
+            baseline: training of the signals, as for `design`.
+            errors: errors of these signals.
+        """
+
+    @abstractmethod
+    def contributions(self, x: ArrayLike) -> Array:
+        """Each signal's part of the newest statistic, shape (p,); x is the newest sample."""
+
+    @classmethod
+    def obstacle(cls, e: Array, names: Sequence[str]) -> str:
+        """The reason why there can be no chart after a training; empty if there can.
+
+        Args:
+            e: prewhitened residuals without missing ones, shape (rows, signals).
+            names: names of the signals.
+        """
+        count = len(names)
+        if count < 2:
+            return "it needs two outputs or more"
+        if count > MOST_SIGNALS:
+            return f"it takes at most {MOST_SIGNALS} outputs, got {count}"
+        if len(e) < ROWS_A_SIGNAL * count:
+            return (
+                f"the training has {len(e)} rows in which all {count} outputs could be learned from, "
+                f"{ROWS_A_SIGNAL * count} are needed"
+            )
+        sizes, directions = np.linalg.eigh(correlation(e))
+        if sizes[0] < 1e-8:  # of one signal's own variance: it varies by rounding only
+            alike = [names[index] for index in np.flatnonzero(np.abs(directions[:, 0]) > 0.1).tolist()]
+            return f"one of the outputs {', '.join(alike)} follows from the others"
+        return ""
+
+    def explain(self, x: ArrayLike, signals: Sequence[Shown]) -> tuple[str, dict[str, float]]:
+        """The text of an alarm, and each signal's share of it.
+
+        Args:
+            x: the newest sample, which is out.
+            signals: signals of the sample, in order.
+        """
+        parts = np.maximum(self.contributions(x), 0.0)
+        shares = parts / np.sum(parts)
+        order = np.argsort(-shares)
+        names = " and ".join(f"{signals[index].name} ({100 * shares[index]:.0f} %)" for index in order)
+        text = f"what the model leaves unexplained is unlike the training: {names}"
+        return text, {signals[index].name: float(shares[index]) for index in order}
+
+
+def complete_rows(e: Array, signals: Sequence[int]) -> Array:
+    """The rows in which none of these signals is missing, shape (rows, len(signals))."""
+    e = e[:, list(signals)]
+    return e[np.all(np.isfinite(e), axis=1)]
+
+
+def correlation(e: Array) -> Array:
+    """Correlation matrix of the columns, shape (columns, columns); 0 with one that does not vary."""
+    off = e - e.mean(axis=0) if len(e) else np.zeros((1, e.shape[1]))
+    lengths = np.linalg.norm(off, axis=0)
+    products = np.outer(lengths, lengths)
+    matrix = off.T @ off / np.where(products > 0, products, 1.0)
+    matrix = 0.5 * (matrix + matrix.T)
+    matrix[np.diag_indices(e.shape[1])] = 1.0
+    return np.asarray(matrix)
 
 
 def format_quantity(value: float, unit: str, form: str = ".3g") -> str:

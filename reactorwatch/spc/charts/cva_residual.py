@@ -17,21 +17,13 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from reactorwatch.spc.charts.base import Array, Setting
-from reactorwatch.spc.statistics_chart import Model, StatisticsChart, standardise
+from reactorwatch.arrays import Array
+from reactorwatch.spc.charts.base import Setting
+from reactorwatch.spc.statistics_chart import EXPLAINED, Model, StatisticsChart, standardise
 from reactorwatch.spc.value_chart import ValueBaseline
 
 ROWS = 3
 """Rows of the past and of the future."""
-
-EXPLAINED = 0.9
-"""Share of the squared canonical correlations that the state has."""
-
-LEAST_VARIANCE = 1e-10
-"""Share of the largest variance of a direction; directions with less are left out."""
-
-ROWS_A_VALUE = 3
-"""Rows of the training for each value of the past."""
 
 
 class CvaResidual(StatisticsChart):
@@ -82,14 +74,14 @@ class CvaResidual(StatisticsChart):
     @classmethod
     def obstacle(cls, values: Array, names: Sequence[str], signals: Mapping[str, tuple[str, ...]]) -> str:
         """See `ValueChart`."""
-        needed = ROWS_A_VALUE * ROWS * len(names)
+        needed = 3 * ROWS * len(names)  # three rows for each value of the past
         if (why := super().obstacle(values, names, signals)) or len(values) >= needed:
             return why
         return f"the training has {len(values)} complete rows, {needed} are needed for {len(names)} signals"
 
 
 def inverse_root(covariance: Array) -> Array:
-    """Matrix that makes values of a covariance white, shape (kept directions, values)."""
+    """Matrix that makes values of a covariance white, shape (directions, values), without directions of no variance."""
     values, vectors = np.linalg.eigh(covariance)
-    kept = values > LEAST_VARIANCE * values[-1]
+    kept = values > 1e-10 * values[-1]
     return np.asarray((vectors[:, kept] / np.sqrt(values[kept])).T)

@@ -9,8 +9,8 @@ modes through multiple principle component analysis models, Ind. Eng. Chem. Res.
     T2 = sum of m_g(x) T2_g(x),    SPE = sum of m_g(x) SPE_g(x),      m_g: memberships of the row,
 
 so that a row between two regimes is judged by both. The number of regimes has the least BIC. Memberships are computed
-from the first components of all rows together. Held-out blocks are spread over the training, which may have seen a
-regime only once.
+from the first three components of all rows together, and a regime has three rows or more for each signal. Held-out
+blocks are spread over the training, which may have seen a regime only once.
 """
 
 from typing import NamedTuple, Self
@@ -18,21 +18,16 @@ from typing import NamedTuple, Self
 import numpy as np
 from scipy import special
 
-from reactorwatch.spc.charts.base import Array, Setting
-from reactorwatch.spc.principal_components import Components, components_of, parts_of
-from reactorwatch.spc.statistics_chart import Model, StatisticsChart, standardise
+from reactorwatch.arrays import Array
+from reactorwatch.spc.charts.base import Setting
+from reactorwatch.spc.statistics_chart import Components, Model, StatisticsChart, components_of, parts_of, standardise
 from reactorwatch.spc.value_chart import ValueBaseline
-
-DIMENSION = 3
-"""Number of the first components from which memberships are computed."""
-
-ROWS_A_SIGNAL = 3
-"""Least number of rows of a regime for each signal."""
 
 RIDGE = 1e-3
 """Share of the variance of all rows that each regime has at least, in every direction."""
 
-_SEED, _STARTS, _STEPS, _CONVERGED = 20_261_123, 4, 200, 1e-6
+SEED = 20_261_123
+"""Seed of the first of the starts, which are always the same ones."""
 
 
 class Mixture(NamedTuple):
@@ -85,8 +80,8 @@ def fit_mixture(rows: Array, regimes: int, fewest: float) -> Mixture:
     best = Mixture.of_memberships(rows, np.ones((len(rows), 1)))
     least = _bic(best, rows)
     for count in range(2, regimes + 1):
-        for start in range(_STARTS):
-            mixture = maximise(rows, divide(rows, count, np.random.default_rng(_SEED + start)), fewest)
+        for start in range(4):
+            mixture = maximise(rows, divide(rows, count, np.random.default_rng(SEED + start)), fewest)
             if mixture is not None and _bic(mixture, rows) < least:
                 best, least = mixture, _bic(mixture, rows)
     return best
@@ -95,12 +90,12 @@ def fit_mixture(rows: Array, regimes: int, fewest: float) -> Mixture:
 def maximise(rows: Array, memberships: Array, fewest: float) -> Mixture | None:
     """Expectation maximisation from memberships on; None if a regime loses its rows."""
     last = -np.inf
-    for _ in range(_STEPS):
+    for _ in range(200):
         if memberships.sum(axis=0).min() < fewest:
             return None
         mixture = Mixture.of_memberships(rows, memberships)
         likelihood, memberships = mixture.log_likelihood(rows), mixture.memberships(rows)
-        if likelihood - last < _CONVERGED * len(rows):
+        if likelihood - last < 1e-6 * len(rows):
             break
         last = likelihood
     return mixture
@@ -138,9 +133,9 @@ class MultiplePca(StatisticsChart):
     def fit(cls, values: Array, baseline: ValueBaseline) -> Model:
         """See `StatisticsChart`."""
         centre, scale, z = standardise(values)
-        plane = np.linalg.svd(z, full_matrices=False)[2][: min(DIMENSION, z.shape[1] - 1)].T
+        plane = np.linalg.svd(z, full_matrices=False)[2][: min(3, z.shape[1] - 1)].T
         regimes = int(baseline.settings["multiple_pca_regimes"])
-        mixture = fit_mixture(z @ plane, regimes, ROWS_A_SIGNAL * z.shape[1])
+        mixture = fit_mixture(z @ plane, regimes, 3 * z.shape[1])
         memberships = mixture.memberships(z @ plane)
         parts = [weighted_components(z, weights) for weights in memberships.T]
         most = max(item.variances.size for _, item in parts)

@@ -13,16 +13,13 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from reactorwatch.spc.charts.base import Array, Setting, SignalSetting
-from reactorwatch.spc.charts.residual_space import BLOCKS
-from reactorwatch.spc.principal_components import components_of, parts_of
-from reactorwatch.spc.statistics_chart import Model, StatisticsChart
-from reactorwatch.spc.value_chart import ValueBaseline
+from reactorwatch.arrays import Array
+from reactorwatch.spc.charts.base import Setting, SignalSetting
+from reactorwatch.spc.statistics_chart import Model, StatisticsChart, components_of, parts_of
+from reactorwatch.spc.value_chart import BLOCKS, ValueBaseline
 
 STAGES = 20
 """Number of intervals of a batch; courses are linear within one."""
-
-FEWEST_BATCHES = 2 * BLOCKS
 
 FALL = 0.5
 """Fall of the progress, as a share of its range, with which a new batch begins."""
@@ -47,9 +44,9 @@ class MultiwayPca(StatisticsChart):
         """See `ValueChart`."""
         if why := super().obstacle(values, names, signals):
             return why
-        count = len(batch_starts(values[:, list(names).index(signals["multiway_pca_progress"][0])]))
-        few = f"the training has {count} batches, {FEWEST_BATCHES} are needed (the progress falls between batches)"
-        return few if count < FEWEST_BATCHES else ""
+        count, needed = len(batch_starts(values[:, list(names).index(signals["multiway_pca_progress"][0])])), 2 * BLOCKS
+        few = f"the training has {count} batches, {needed} are needed (the progress falls between batches)"
+        return few if count < needed else ""
 
     @classmethod
     def edges(cls, baseline: ValueBaseline) -> list[int]:

@@ -24,10 +24,11 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike
 
+from reactorwatch.arrays import Array
 from reactorwatch.errors import InputError
-from reactorwatch.spc.baseline import Baseline
-from reactorwatch.spc.charts.base import Array, Judgement, vector
-from reactorwatch.spc.joint_chart import JointChart
+from reactorwatch.spc.charts.base import Baseline, JointChart, Judgement, vector
+from reactorwatch.spc.charts.t2 import T2
+from reactorwatch.spc.false_alarm_budget import TrainingErrors
 from reactorwatch.stored_state import Memory
 
 
@@ -119,6 +120,11 @@ class _PcaChart(JointChart):
         spans = np.ptp(e, axis=0) if len(e) else np.zeros(len(names))
         still = "" if np.all(spans > 0.0) else names[int(np.argmin(spans))]
         return super().obstacle(e, names) or (still and f"the residual of {still} does not vary in the training")
+
+    @classmethod
+    def relative_rates(cls, baseline: Baseline, errors: TrainingErrors) -> Array:
+        """See `JointChart`; they count as those of T2."""
+        return T2.relative_rates(baseline, errors)
 
     def restart(self) -> None:
         """Do nothing: there is no memory."""

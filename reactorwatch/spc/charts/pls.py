@@ -18,16 +18,13 @@ from typing import NamedTuple, Self
 
 import numpy as np
 
-from reactorwatch.spc.charts.base import Array, Setting, SignalSetting
-from reactorwatch.spc.charts.residual_space import BLOCKS
+from reactorwatch.arrays import Array
+from reactorwatch.spc.charts.base import Setting, SignalSetting
 from reactorwatch.spc.statistics_chart import Model, StatisticsChart, standardise
-from reactorwatch.spc.value_chart import ValueBaseline
+from reactorwatch.spc.value_chart import BLOCKS, ValueBaseline
 
 MOST_COMPONENTS = 8
 """Largest number of components; there is always one less than signals, so that something is left for SPE."""
-
-LEAST_COVARIANCE = 1e-8
-"""Length of X'Y, in shares of its first, below which there are no more components."""
 
 
 class Projection(NamedTuple):
@@ -49,7 +46,7 @@ class Projection(NamedTuple):
         weights, loadings, of_quality, first = [], [], [], 0.0
         for _ in range(count):
             directions, sizes, _ = np.linalg.svd(x.T @ y, full_matrices=False)
-            if sizes[0] <= LEAST_COVARIANCE * first:
+            if sizes[0] <= 1e-8 * first:  # X'Y is used up but for rounding
                 break
             first = max(first, float(sizes[0]))
             scores = x @ directions[:, 0]

@@ -35,28 +35,23 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import special
 
+from reactorwatch.arrays import Array
 from reactorwatch.codegen.numba_kernel import Entry, jit
 from reactorwatch.errors import InputError, positive
-from reactorwatch.spc.charts.base import LARGEST_VALUE, Array, Judgement, Setting, vector
-from reactorwatch.spc.run_length.control_limits import ewma_limit
-from reactorwatch.spc.training_errors import TrainingErrors, student_tail
-from reactorwatch.spc.value_chart import ValueBaseline, ValueChart, student_limit
+from reactorwatch.spc.charts.base import LARGEST_VALUE, Judgement, Setting, vector
+from reactorwatch.spc.charts.ewma import ewma_limit
+from reactorwatch.spc.false_alarm_budget import TrainingErrors, student_tail
+from reactorwatch.spc.value_chart import (
+    BLOCKS,
+    NAMED,
+    ValueBaseline,
+    ValueChart,
+    adjustment,
+    average_rows,
+    fill_missing,
+    student_limit,
+)
 from reactorwatch.stored_state import Memory
-
-BLOCKS = 5
-"""Blocks of the cross-validation."""
-
-SHRINKAGE = 0.01
-"""Share by which correlations are reduced: without it, signals that follow from others have no inverse."""
-
-LONGEST_LAG = 10.0
-"""Longest lag of the averages' autocorrelation, in units of their memory (rows divided by weight)."""
-
-MOST_MISSING = 0.5
-"""Share of missing signals of a row beyond which it is skipped."""
-
-NAMED = 3
-"""Signals that the text of an alarm names."""
 
 
 @jit
@@ -194,39 +189,6 @@ class ResidualSpace(ValueChart):
         self._averages[:] = 0.0
 
 
-def fill_missing(x: Array, centre: Array, matrix: Array) -> Array | None:
-    """The sample with the mean given the others in place of missing signals; None if too many are missing.
-
-    Args:
-        x: values of the signals, shape (p,); NaN where missing.
-        centre: mean of each signal, shape (p,).
-        matrix: matrix from deviations of the signals to residuals, each in any unit, shape (p, p).
-    """
-    missing = ~np.isfinite(x)
-    count = int(np.count_nonzero(missing))
-    if not count:
-        return x
-    if count > MOST_MISSING * x.size:
-        return None
-    off = np.where(missing, 0.0, x - centre)
-    off[missing] = -np.linalg.solve(matrix[np.ix_(missing, missing)], matrix[missing] @ off)
-    return np.asarray(np.where(missing, centre + off, x))
-
-
-def adjustment(rows: Array) -> tuple[Array, Array]:
-    """Means of signals, and the matrix from their deviations to the residuals w.
-
-    Args:
-        rows: scaled signals, shape (rows, p).
-    """
-    centre = rows.mean(axis=0)
-    covariance = np.atleast_2d(np.cov(rows, rowvar=False))
-    covariance *= 1.0 - SHRINKAGE
-    covariance[np.diag_indices_from(covariance)] /= 1.0 - SHRINKAGE
-    inverse = np.linalg.inv(covariance)
-    return np.asarray(centre), np.asarray(inverse / np.sqrt(np.diag(inverse))[:, None])
-
-
 def held_out_residuals(rows: Array) -> Array:
     """Residuals of each block of a training by the covariance of the other blocks, shape (rows, p).
 
@@ -255,20 +217,6 @@ def held_out_deviations(scaled: Array, weight: float) -> tuple[Array, float, flo
     return sds, freedom, float(np.max(np.abs(averages) / sds))
 
 
-def average_rows(residuals: Array, weight: float) -> Array:
-    """Exponentially weighted averages of residuals from 0 on, without the first ones, shape (rows, p).
-
-    Args:
-        residuals: held-out residuals, shape (rows, p).
-        weight: lambda.
-    """
-    averages, average = np.empty_like(residuals), np.zeros(residuals.shape[1])
-    for row, residual in enumerate(residuals):
-        average = average + weight * (residual - average)
-        averages[row] = average
-    return averages[min(int(2.0 / weight), len(averages) // 2) :]
-
-
 def degrees_of_freedom(averages: Array, weight: float) -> float:
     """Degrees of freedom of the mean square of each average.
 
@@ -277,7 +225,7 @@ def degrees_of_freedom(averages: Array, weight: float) -> float:
         weight: lambda.
     """
     rows, sums = len(averages), np.sum(averages**2, axis=0)
-    lags = range(1, min(int(LONGEST_LAG / weight), rows // 2))
+    lags = range(1, min(int(10.0 / weight), rows // 2))  # up to ten memories of an average
     squares = [float(np.mean(np.sum(averages[k:] * averages[:-k], axis=0) / sums)) ** 2 for k in lags]
     return rows / (1.0 + 2.0 * sum(squares))
 

@@ -51,12 +51,12 @@ from benchmarks.harness.bank import (
 )
 from reactorwatch.arrays import Array
 from reactorwatch.contract.messages_pb2 import Alarm, Incident, Suspect
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import cstr
 from reactorwatch.process.profiles import STEP
 from reactorwatch.process.simulate import Simulator
 from reactorwatch.process.steady_state import start_state
 from reactorwatch.records.record import Record, to_time_ns
-from reactorwatch.spc import run_length
+from reactorwatch.spc.charts.cusum import cusum_run_length
 
 RAMP = Fault("temperature_bias", "ramp", (0.2, 1.0, 8.0))
 ARL0 = rows_to_false_alarm(1.0)
@@ -178,7 +178,7 @@ def test_in_noise_the_mean_delay_is_that_of_walds_identity() -> None:
 def test_pages_test_with_that_threshold_has_at_least_the_promised_run_length(shift: float) -> None:
     arl0 = 2000.0
     # In units of sigma: allowance shift / 2, limit ln(arl0) / shift; one side has twice the run length of two.
-    one_sided = 2 * run_length.cusum(0.0, shift / 2, log(arl0) / shift)
+    one_sided = 2 * cusum_run_length(0.0, shift / 2, log(arl0) / shift)
     assert one_sided >= arl0
 
 

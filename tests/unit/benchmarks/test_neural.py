@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from benchmarks.study_figures.neural import Neural
-from reactorwatch.identification.families import LINEAR_FAMILIES
 from reactorwatch.identification.linear_model import fit_percent
-from reactorwatch.identification.selection import select
+from reactorwatch.identification.selection import LINEAR_FITS, select
 from reactorwatch.identification.structure import Structure
 from tests.unit.identification.truth import Array, oscillating_plant
 
@@ -23,7 +22,7 @@ def bent_plant(rows: int = 1500) -> tuple[Array, Array]:
 
 
 def test_a_bent_plant_is_followed_where_no_linear_model_can() -> None:
-    selection = select(*bent_plant(), families=(*LINEAR_FAMILIES, SMALL), orders=(1,))
+    selection = select(*bent_plant(), fits={**LINEAR_FITS, "neural": SMALL.fit}, orders=(1,))
     linear = max(c.free_run_percent for c in selection.candidates if c.family != "neural")
     assert selection.chosen.family == "neural"
     assert linear < 85.0

@@ -15,7 +15,7 @@ from benchmarks.harness.tables import median_interval, poisson_interval, share_i
 from benchmarks.promise import black_box
 from benchmarks.promise.not_quite import Outcome, Plant, print_counts, print_delays
 from plant_node.record import simulate_record
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import cstr
 from reactorwatch.process.simulate import Simulator
 
 ROOT = Path(__file__).parents[3]

@@ -34,7 +34,7 @@ numba.njit = register
 from monitor_node.config import MonitorConfig
 from monitor_node.causes.stage import preparation
 from reactorwatch.cli import kernels
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import cstr
 from reactorwatch.codegen.cache import CodeCache
 
 made, keep = [], CodeCache._store

@@ -83,7 +83,7 @@ def test_an_unexpected_error_is_one_line_with_the_path_of_a_report(
     for name in (
         "recorder.tools.inspect.inspect",
         "reactorwatch.cli.linear_models.describe",
-        "reactorwatch.spc.run_length.control_limits.design",
+        "reactorwatch.spc.charts.ewma.Ewma.fastest",
     ):
         monkeypatch.setattr(name, crashing)
     assert run(shlex.split(typed), monkeypatch) == crash.EXIT_CODE == 70

@@ -17,7 +17,7 @@ from reactorwatch.cli.processes import Processes
 from reactorwatch.description.find import find_process
 from reactorwatch.description.process import Process, describe_model
 from reactorwatch.errors import InputError
-from reactorwatch.process.library.cascaded_tanks.model import tanks
+from reactorwatch.process.library.cascaded_tanks import tanks
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.simulate import Simulator
 from reactorwatch.records.record import Record
@@ -37,7 +37,7 @@ unit = "V"
 """
 CODE = """
 import reactorwatch as rw
-from reactorwatch.process.library.cascaded_tanks.model import tanks
+from reactorwatch.process.library.cascaded_tanks import tanks
 
 
 def process():

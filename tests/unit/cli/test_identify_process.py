@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 import reactorwatch as rw
 from reactorwatch.cli import main as cli
 from reactorwatch.cli.main import app
-from tests.unit.identification.systems import ARX
+from tests.unit.identification.truth import ARX
 
 TOML = """
 name = "exchanger"

@@ -13,7 +13,7 @@ from reactorwatch.cli.linear_models import describe
 from reactorwatch.description.find import find_process
 from reactorwatch.errors import InputError
 from reactorwatch.identification.identify import ModelForm
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import cstr
 from reactorwatch.records.record import Record
 from tests.tables import read_csv
 

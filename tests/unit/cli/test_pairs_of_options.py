@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from reactorwatch.process.library.cascaded_tanks.model import tanks
-from reactorwatch.process.library.cstr.examples import EXAMPLES
-from reactorwatch.process.library.cstr.model import cstr
-from reactorwatch.process.library.three_tanks.model import three_tanks
+from reactorwatch.process.library.cascaded_tanks import tanks
+from reactorwatch.process.library.cstr import cstr
+from reactorwatch.process.library.cstr_operation import EXAMPLES
+from reactorwatch.process.library.three_tanks import three_tanks
 from reactorwatch.process.simulate import Simulator
 from reactorwatch.records.record import Record
 from reactorwatch.records.write import write_table

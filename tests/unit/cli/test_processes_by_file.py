@@ -12,8 +12,8 @@ from monitor_node.config import MonitorConfig
 from reactorwatch.cli.main import app
 from reactorwatch.cli.verification import _recorded_process
 from reactorwatch.errors import InputError
-from reactorwatch.process.fingerprint import fingerprint
-from reactorwatch.process.library.three_tanks.model import three_tanks
+from reactorwatch.process.library.three_tanks import three_tanks
+from reactorwatch.process.model import fingerprint
 from recorder.files.recording import Recording
 from tests.unit.process.test_three_tanks import measure
 
@@ -79,7 +79,7 @@ from dataclasses import replace
 
 import reactorwatch as rw
 from reactorwatch.process.effect import Effect
-from reactorwatch.process.library.three_tanks.model import three_tanks
+from reactorwatch.process.library.three_tanks import three_tanks
 from reactorwatch.records.file_format import FileFormat
 
 

@@ -18,7 +18,7 @@ from reactorwatch.cli import identification
 from reactorwatch.contract.codec import encode
 from reactorwatch.errors import InputError
 from reactorwatch.identification.identify import ModelForm
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import cstr
 from reactorwatch.records.record import Record, join_runs
 from recorder.tools.player import samples_of
 

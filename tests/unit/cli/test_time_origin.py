@@ -19,14 +19,14 @@ from reactorwatch.cli.options import parse_span_ns
 from reactorwatch.cli.recordings import cut
 from reactorwatch.description.choice import ProcessChoice
 from reactorwatch.diagnosis.diagnose import diagnose
-from reactorwatch.process.library.cstr.effects.coolant_flow import CoolantFlow
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import cstr
 from reactorwatch.records.record import Record
 from reactorwatch.records.write import write_table
 from reactorwatch.runtime.model_file import write_extended_model
 from recorder.columns import read_run
 from recorder.tools.convert import import_csv, read_record
 from recorder.tools.inspect import inspect
+from tests.unit.process.effect_named import effect_of
 
 ROWS, ONSET_MIN = 600, 40.0
 ORIGINS = [-ONSET_MIN, -59.9, -1.0, -5000.0, 250.0]
@@ -99,7 +99,7 @@ def test_a_diagnosis_gives_the_onset_in_the_minutes_of_the_file(
     leaking: Record, tmp_path: Path, origin_min: float
 ) -> None:
     for path in written(tmp_path, leaking, origin_min):
-        found = diagnose(record(path), cstr(), [CoolantFlow()])
+        found = diagnose(record(path), cstr(), [effect_of("coolant_flow")])
         assert found.causes[0].parameters["onset"].value == pytest.approx(ONSET_MIN + origin_min, abs=0.1)
 
 

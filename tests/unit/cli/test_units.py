@@ -16,7 +16,7 @@ from reactorwatch.cli.batch import Job
 from reactorwatch.cli.main import app
 from reactorwatch.diagnosis.units import find_wrong_unit
 from reactorwatch.errors import InputError
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import cstr
 from reactorwatch.records.record import Record
 from reactorwatch.records.write import write_table
 from tests.unit.diagnosis.runs import record_of

@@ -11,8 +11,8 @@ from reactorwatch.description.process import KnownParameter, Process, Signal, de
 from reactorwatch.errors import InputError
 from reactorwatch.process import EFFECTS_OF
 from reactorwatch.process.effect import Effect, ParameterShift
-from reactorwatch.process.library.cascaded_tanks.model import tanks
-from reactorwatch.process.library.three_tanks.model import three_tanks
+from reactorwatch.process.library.cascaded_tanks import tanks
+from reactorwatch.process.library.three_tanks import three_tanks
 from reactorwatch.process.model import ProcessModel
 
 Q = Signal("q", "l/s", "input")

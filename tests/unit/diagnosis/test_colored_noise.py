@@ -10,7 +10,7 @@ from reactorwatch.arrays import Array
 from reactorwatch.diagnosis.fitting.colored_noise import Noise, detect_colored_noise
 from reactorwatch.diagnosis.fitting.fault_filter import FaultFilter
 from reactorwatch.diagnosis.run import Run
-from reactorwatch.process.library.cstr.model import OPERATING_STATE, cstr
+from reactorwatch.process.library.cstr import OPERATING_STATE, cstr
 from reactorwatch.process.simulate import Simulator
 
 NAMES = ("C", "T")

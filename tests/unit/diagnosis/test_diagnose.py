@@ -12,7 +12,7 @@ from reactorwatch.diagnosis.diagnose import diagnose
 from reactorwatch.diagnosis.record_checks import make_run
 from reactorwatch.diagnosis.result import NAMED, NOMINAL, UNKNOWN
 from reactorwatch.errors import InputError
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import cstr
 from reactorwatch.records.record import Record
 from tests.tables import read_csv
 from tests.unit.diagnosis.runs import record_of

@@ -8,7 +8,7 @@ from reactorwatch.diagnosis.fitting.profiles import Decay, FittedProfile, Ramp, 
 from reactorwatch.diagnosis.run import Run
 from reactorwatch.diagnosis.search.dynamic_effects_screen import DynamicEffectsScreen
 from reactorwatch.diagnosis.search.screen import DECAYS
-from reactorwatch.process.library.cstr.effects import EFFECTS
+from reactorwatch.process.library.cstr import EFFECTS
 
 TIME_MIN: Array = np.arange(0.0, 100.0, 0.1)
 LAG = next(effect for effect in EFFECTS if effect.name == "jacket_lag")

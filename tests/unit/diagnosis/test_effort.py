@@ -8,7 +8,7 @@ import pytest
 from reactorwatch.diagnosis.diagnose import diagnose
 from reactorwatch.kalman.ekf import Filter
 from reactorwatch.kalman.error_dynamics import ErrorLinearization
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import cstr
 from tests.unit.diagnosis.runs import record_of
 
 

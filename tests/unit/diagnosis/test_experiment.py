@@ -19,8 +19,7 @@ from reactorwatch.diagnosis.result import Experiment
 from reactorwatch.diagnosis.run import Run
 from reactorwatch.diagnosis.search.search import FittedHypothesis
 from reactorwatch.errors import InputError
-from reactorwatch.process.library.cstr.effects import EFFECTS
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import EFFECTS, cstr
 from reactorwatch.records.record import Record
 from tests.unit.diagnosis.linear_tank import NOISE, Gain, Shift, explained, tank
 from tests.unit.diagnosis.linear_tank import record as tank_record

@@ -7,7 +7,7 @@ from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from reactorwatch.diagnosis.diagnose import diagnose
 from reactorwatch.diagnosis.result import NAMED
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import cstr
 from reactorwatch.records.record import Record
 
 LIMITS = {"qc": (95.0, 112.0), "T": (425.0, 455.0)}

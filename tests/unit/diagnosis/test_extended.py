@@ -9,8 +9,7 @@ from reactorwatch.diagnosis.extended import extended_model
 from reactorwatch.diagnosis.fitting.profiles import Decay, FittedProfile, PiecewiseLinear, Ramp, Sine, Step
 from reactorwatch.diagnosis.result import Cause, Estimate
 from reactorwatch.process.extended_model import parse_extended_model
-from reactorwatch.process.library.cstr.effects import EFFECTS
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import EFFECTS, cstr
 from reactorwatch.process.model import ProcessModel
 
 TIMES_MIN = np.arange(0.0, 100.05, 0.1)

@@ -14,8 +14,7 @@ from reactorwatch.diagnosis.fitting.colored_noise import ColoredNoise, Noise
 from reactorwatch.diagnosis.high_frequency_noise import estimate_sensor_noise
 from reactorwatch.diagnosis.result import UNKNOWN
 from reactorwatch.process.effect import Effect
-from reactorwatch.process.library.cstr.effects import EFFECTS
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import EFFECTS, cstr
 from reactorwatch.records.record import Record
 from tests.unit.diagnosis.runs import record_of
 

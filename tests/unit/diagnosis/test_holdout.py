@@ -10,8 +10,7 @@ from reactorwatch.diagnosis.fitting.profiles import Step
 from reactorwatch.diagnosis.holdout import evaluate_holdout, holdout_rows
 from reactorwatch.diagnosis.run import Run
 from reactorwatch.diagnosis.search.search import FittedHypothesis
-from reactorwatch.process.library.cstr.effects import EFFECTS
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import EFFECTS, cstr
 from tests.unit.diagnosis.runs import make_run
 
 SENSORS = Noise((0.002, 0.3), (0.0, 0.0))

@@ -14,8 +14,8 @@ from reactorwatch.diagnosis.record_checks import make_run
 from reactorwatch.diagnosis.result import NOMINAL
 from reactorwatch.diagnosis.usual_excitation import ROWS, excite
 from reactorwatch.process import effects_of
-from reactorwatch.process.library.cascaded_tanks.effects import TANK_EFFECTS
-from reactorwatch.process.library.cascaded_tanks.model import tanks
+from reactorwatch.process.library.cascaded_tanks import EFFECTS as TANK_EFFECTS
+from reactorwatch.process.library.cascaded_tanks import tanks
 from reactorwatch.records.record import Record
 from tests.unit.diagnosis.linear_tank import NOISE_SD, PERIOD_MIN, follows, tank
 

@@ -12,8 +12,8 @@ from reactorwatch.api.simulation import simulate_along
 from reactorwatch.cli.diagnosis import DiagnosisOptions, load_case
 from reactorwatch.diagnosis.record_checks import make_run
 from reactorwatch.errors import InputError
-from reactorwatch.process.library.cascaded_tanks.model import tanks
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cascaded_tanks import tanks
+from reactorwatch.process.library.cstr import cstr
 from reactorwatch.records.record import Record
 from reactorwatch.records.write import write_table
 from tests.tables import read_csv

@@ -10,8 +10,7 @@ from reactorwatch.diagnosis.fitting.hypothesis import MOST_STEPS, Hypothesis
 from reactorwatch.diagnosis.fitting.input_timing import effective_timing
 from reactorwatch.diagnosis.fitting.onset_refinement import refine_onset
 from reactorwatch.diagnosis.fitting.profiles import Decay, FittedProfile, Ramp, Step
-from reactorwatch.process.library.cstr.effects import EFFECTS
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import EFFECTS, cstr
 from tests.unit.diagnosis.runs import make_run
 
 TIMES: Array = np.cumsum(np.append(0.0, np.random.default_rng(3).choice([0.05, 0.1, 0.2], 100)))

@@ -7,8 +7,7 @@ from reactorwatch.diagnosis.fitting.hypothesis import Hypothesis
 from reactorwatch.diagnosis.fitting.knot_selection import GRID, select_knots
 from reactorwatch.diagnosis.fitting.profiles import PiecewiseLinear
 from reactorwatch.diagnosis.search.search import FittedHypothesis, Search
-from reactorwatch.process.library.cstr.effects import EFFECTS
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import EFFECTS, cstr
 from tests.unit.diagnosis.runs import make_run
 
 LAST_MIN = 149.9

@@ -10,8 +10,8 @@ from reactorwatch.diagnosis.lasting import fit_lasting, prefer_lasting
 from reactorwatch.diagnosis.record_checks import make_run
 from reactorwatch.diagnosis.search.search import FittedHypothesis, Search, SearchResult, smallest_noise
 from reactorwatch.process.effect import Effect
-from reactorwatch.process.library.cascaded_tanks.effects import TANK_EFFECTS
-from reactorwatch.process.library.cascaded_tanks.model import tanks
+from reactorwatch.process.library.cascaded_tanks import EFFECTS as TANK_EFFECTS
+from reactorwatch.process.library.cascaded_tanks import tanks
 from tests.unit.diagnosis.rig import LOWER_SPILL_PER_MIN, NOISE_V, Rig, record_of
 
 CONSTANTS = ("k1", "k2", "k3", "k4")

@@ -17,8 +17,7 @@ from reactorwatch.diagnosis.unknown_input.localise import UnknownInput, has_feed
 from reactorwatch.kalman.batch import FilterRecord
 from reactorwatch.kalman.noise_estimation import fit_noise
 from reactorwatch.process.effect import Effect
-from reactorwatch.process.library.cstr.effects import EFFECTS
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import EFFECTS, cstr
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.simulate import Simulator
 

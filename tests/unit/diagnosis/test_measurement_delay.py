@@ -8,8 +8,7 @@ from reactorwatch.diagnosis.fitting.fault_filter import FaultFilter
 from reactorwatch.diagnosis.fitting.measurement_delay import shift_measurements
 from reactorwatch.diagnosis.fitting.profiles import Constant
 from reactorwatch.diagnosis.run import Run
-from reactorwatch.process.library.cstr.effects import EFFECTS
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import EFFECTS, cstr
 from tests.unit.diagnosis.runs import make_run
 
 SENSORS = Noise((0.002, 0.3), (0.0, 0.0))

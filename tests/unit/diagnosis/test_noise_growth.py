@@ -17,8 +17,8 @@ from reactorwatch.kalman.ekf import Filter
 from reactorwatch.kalman.ekf_step import NoiseLevels
 from reactorwatch.process import effects_of
 from reactorwatch.process.extended_model import parse_extended_model
-from reactorwatch.process.generic_effects import generic_effects
-from reactorwatch.process.library.three_tanks.model import three_tanks
+from reactorwatch.process.generic import generic_effects
+from reactorwatch.process.library.three_tanks import three_tanks
 from reactorwatch.process.profiles import STEP
 from reactorwatch.records.record import Record
 from tests.unit.diagnosis.linear_tank import NOISE_SD, PERIOD_MIN, follows, tank

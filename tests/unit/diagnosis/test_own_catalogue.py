@@ -13,8 +13,7 @@ from reactorwatch.diagnosis.report.plain import as_text
 from reactorwatch.diagnosis.result import AMBIGUOUS, NAMED, NOMINAL, UNKNOWN
 from reactorwatch.process import effects_of
 from reactorwatch.process.effect import Effect
-from reactorwatch.process.library.cstr.effects import EFFECTS
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import EFFECTS, cstr
 from reactorwatch.records.record import Record
 from tests.unit.diagnosis.linear_tank import NOISE_SD, PERIOD_MIN, Shift, follows, tank
 from tests.unit.diagnosis.runs import record_of

@@ -12,9 +12,7 @@ from reactorwatch.diagnosis.fitting.hypothesis import Hypothesis
 from reactorwatch.diagnosis.fitting.profiles import Constant
 from reactorwatch.diagnosis.record_checks import make_run
 from reactorwatch.diagnosis.result import NAMED
-from reactorwatch.process.library.cstr.effects.side_reaction import SideReaction
-from reactorwatch.process.library.cstr.effects.wall_heat_capacity import WallHeatCapacity
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import SideReaction, WallHeatCapacity, cstr
 from tests.unit.diagnosis.runs import record_of
 
 NOISE = Noise((0.002, 0.3), (0.001, 0.1))

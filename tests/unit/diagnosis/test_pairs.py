@@ -13,8 +13,7 @@ from reactorwatch.diagnosis.fitting.hypothesis import Hypothesis
 from reactorwatch.diagnosis.result import NAMED
 from reactorwatch.diagnosis.search.pair_screen import PairScreen
 from reactorwatch.diagnosis.search.screen import Screen
-from reactorwatch.process.library.cstr.effects import EFFECTS
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import EFFECTS, cstr
 from tests.unit.diagnosis.runs import make_run, record_of
 
 FOLLOWING = Noise((0.002, 0.3), (0.001, 0.3))

@@ -16,7 +16,7 @@ from reactorwatch.errors import InputError
 from reactorwatch.kalman.batch import FilterRecord
 from reactorwatch.kalman.ekf import Filter
 from reactorwatch.process.extended_model import parse_extended_model
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import cstr
 from tests.unit.diagnosis.runs import make_run, record_of
 
 SENSORS = Noise((0.002, 0.3), (0.0, 0.0))

@@ -9,8 +9,7 @@ from reactorwatch.diagnosis.profile_likelihood import WITHIN_ROW, refine
 from reactorwatch.diagnosis.record_checks import make_run as of_record
 from reactorwatch.diagnosis.result import Estimate
 from reactorwatch.diagnosis.search.search import Search
-from reactorwatch.process.library.cstr.effects import EFFECTS
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import EFFECTS, cstr
 from tests.hidden_effect.catalogue import named
 from tests.hidden_effect.draw import draw
 from tests.hidden_effect.excitation import NAMED_CIRCUMSTANCES

@@ -10,9 +10,9 @@ from reactorwatch.diagnosis.identifiability import identifiability
 from reactorwatch.diagnosis.record_checks import make_run
 from reactorwatch.diagnosis.search.search import Search, smallest_noise
 from reactorwatch.diagnosis.usual_excitation import excite
-from reactorwatch.process.generic_effects import generic_effects
-from reactorwatch.process.library.cascaded_tanks.model import tanks
-from reactorwatch.process.library.three_tanks.model import three_tanks
+from reactorwatch.process.generic import generic_effects
+from reactorwatch.process.library.cascaded_tanks import tanks
+from reactorwatch.process.library.three_tanks import three_tanks
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.simulate import Simulator
 from reactorwatch.records.record import Record

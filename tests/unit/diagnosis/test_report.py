@@ -16,8 +16,7 @@ from reactorwatch.diagnosis.report.page import as_page
 from reactorwatch.diagnosis.report.svg import COLUMNS, decimate
 from reactorwatch.diagnosis.result import UnknownInputCurve
 from reactorwatch.process.effect import Effect
-from reactorwatch.process.library.cstr.effects import EFFECTS
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import EFFECTS, cstr
 from reactorwatch.process.model import ProcessModel
 from tests.unit.diagnosis.cases import ADJUSTED, CASES
 

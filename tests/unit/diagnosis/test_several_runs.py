@@ -13,14 +13,14 @@ from reactorwatch.diagnosis.report.machine import as_object
 from reactorwatch.diagnosis.report.plain import as_text
 from reactorwatch.errors import InputError
 from reactorwatch.process.extended_model import parse_extended_model
-from reactorwatch.process.library.cstr.effects.coolant_flow import CoolantFlow
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import cstr
 from reactorwatch.records.record import Record, join_runs
 from tests.unit.diagnosis.runs import record_of
+from tests.unit.process.effect_named import effect_of
 
 ROWS, FIRST = 1600, 900
 ONSET_MIN = 120.0
-CATALOGUE = [CoolantFlow()]
+CATALOGUE = [effect_of("coolant_flow")]
 
 
 @pytest.fixture(scope="module")

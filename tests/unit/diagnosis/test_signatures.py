@@ -15,8 +15,7 @@ from reactorwatch.diagnosis.run import Run
 from reactorwatch.diagnosis.search.screen import Screen
 from reactorwatch.kalman.error_dynamics import ErrorDynamics
 from reactorwatch.process.effect import Effect
-from reactorwatch.process.library.cstr.effects import EFFECTS
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import EFFECTS, cstr
 from tests.unit.diagnosis.runs import make_run
 
 NOISY = Noise((0.002, 0.3), (0.001, 0.3))

@@ -16,7 +16,7 @@ from reactorwatch.diagnosis.report.words import describe_verdict
 from reactorwatch.diagnosis.result import NAMED, NOMINAL, Diagnosis
 from reactorwatch.process import effects_of
 from reactorwatch.process.extended_model import parse_extended_model
-from reactorwatch.process.library.cascaded_tanks.model import tanks
+from reactorwatch.process.library.cascaded_tanks import tanks
 from tests.unit.diagnosis.rig import NOISE_V, Rig, record_of
 
 

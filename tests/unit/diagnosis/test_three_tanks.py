@@ -12,7 +12,7 @@ from reactorwatch.diagnosis.fitting.augmented_model import augment_model
 from reactorwatch.diagnosis.fitting.profiles import LateSine, Signal, Sine
 from reactorwatch.diagnosis.result import NAMED, UNKNOWN, Diagnosis
 from reactorwatch.process import EFFECTS_OF
-from reactorwatch.process.library.three_tanks.model import three_tanks
+from reactorwatch.process.library.three_tanks import three_tanks
 from reactorwatch.process.simulate import Simulator
 from reactorwatch.records.record import Record
 

@@ -11,8 +11,8 @@ from reactorwatch.diagnosis.report.plain import as_text
 from reactorwatch.diagnosis.report.words import describe_size, describe_verdict, format_interval
 from reactorwatch.diagnosis.result import Cause, Diagnosis, Estimate
 from reactorwatch.process.effect import Effect
-from reactorwatch.process.library.cascaded_tanks.effects import TANK_EFFECTS
-from reactorwatch.process.library.cstr.effects import EFFECTS
+from reactorwatch.process.library.cascaded_tanks import EFFECTS as TANK_EFFECTS
+from reactorwatch.process.library.cstr import EFFECTS
 from tests.unit.diagnosis.cases import ADJUSTED, CASES, ROWS
 
 

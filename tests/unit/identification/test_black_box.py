@@ -16,9 +16,8 @@ from reactorwatch.identification.black_box.filter import (
     filter_row,
 )
 from reactorwatch.identification.black_box.fit import MOST_PARAMETERS, fit_black_box, largest_shapes, row_kinds
-from reactorwatch.identification.black_box.model import BlackBoxModel
+from reactorwatch.identification.black_box.model import BlackBoxModel, Shape, lagged_inputs
 from reactorwatch.identification.black_box.prediction_error import NEXT, START, prediction_errors
-from reactorwatch.identification.black_box.state_map import Shape, lagged_inputs
 from reactorwatch.stored_state import copy_of
 
 NOISE_SD = np.array([0.1, 0.2])

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from reactorwatch.identification.linear_model import standard_deviations
 from reactorwatch.identification.rls import RecursiveLeastSquares, RlsMemory
 from tests.unit.identification.truth import Array, exact_least_squares
 
@@ -73,7 +74,7 @@ def test_as_many_rows_as_parameters_are_met_exactly() -> None:
     regressors, outputs = rng.standard_normal((4, 4)), rng.standard_normal(4)
     rls = learn(regressors, outputs)
     np.testing.assert_allclose(regressors @ rls.parameters, outputs, atol=1e-12)
-    assert np.all(np.isinf(rls.standard_deviations)), "no row is left to tell the noise"
+    assert np.all(np.isinf(standard_deviations(rls.parameter_covariance))), "no row is left to tell the noise"
 
 
 def test_a_column_without_information_gets_the_parameter_zero_and_no_certainty() -> None:
@@ -83,7 +84,7 @@ def test_a_column_without_information_gets_the_parameter_zero_and_no_certainty()
     regressors = np.column_stack([x, x, np.zeros(200), np.ones(200)])
     rls = learn(regressors, 2.0 * x + 1.0 + 0.1 * rng.standard_normal(200))
     np.testing.assert_allclose(rls.parameters, [2.0, 0.0, 0.0, 1.0], atol=0.05)
-    np.testing.assert_array_equal(np.isinf(rls.standard_deviations), [True, True, True, False])
+    np.testing.assert_array_equal(np.isinf(standard_deviations(rls.parameter_covariance)), [True, True, True, False])
     assert np.isinf(rls.condition)
 
 
@@ -141,7 +142,7 @@ def test_a_million_rows_without_excitation_leave_it_sound(forgetting: float, lev
     rows_in_memory = 1_000_500 if forgetting == 1.0 else 1.0 / (1.0 - forgetting)
     largest = max(n * level**2, *np.sum(lively**2, axis=1))
     assert 1.0 / eigenvalues[0] <= rows_in_memory * largest + 1.0 / (limit * forgetting ** (n - 1))
-    assert np.all(np.isfinite(rls.standard_deviations))
+    assert np.all(np.isfinite(standard_deviations(rls.parameter_covariance)))
     assert rls.rows == 1_000_500
     for row in rng.standard_normal((3000, n)):
         rls.update(row, row @ second)
@@ -176,7 +177,7 @@ def test_standard_deviations_are_the_scatter_of_many_plants(forgetting: float) -
         last = [rls.update(*row) for rls, *row in zip(found, regressors, outputs.tolist(), strict=True)]
     parameters = np.array([rls.parameters for rls in found])
     observed = np.std(parameters, axis=0)
-    reported = np.sqrt(np.mean([rls.standard_deviations**2 for rls in found[::20]], axis=0))
+    reported = np.sqrt(np.mean([standard_deviations(rls.parameter_covariance) ** 2 for rls in found[::20]], axis=0))
     np.testing.assert_allclose(reported, observed, rtol=0.05)
     np.testing.assert_allclose(np.mean(parameters, axis=0), truth, atol=4 * observed.max() / np.sqrt(plants))
     residuals, deviations = np.transpose([(update.residual, update.residual_sd) for update in last])

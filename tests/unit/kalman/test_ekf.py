@@ -11,22 +11,20 @@ import pytest
 from scipy.linalg import expm, solve_discrete_are
 from scipy.stats import chi2, multivariate_normal
 
-from plant_node.config import PlantConfig
-from plant_node.record import simulate_record
 from reactorwatch.arrays import Array
 from reactorwatch.kalman.batch import FilterRecord, Innovation
 from reactorwatch.kalman.ekf import Filter, FilterState
 from reactorwatch.kalman.ekf_step import NoiseLevels
 from reactorwatch.process.fault import parse_fault
-from reactorwatch.process.library.cstr.model import OPERATING_COOLANT_FLOW, OPERATING_STATE, cstr
+from reactorwatch.process.library.cstr import OPERATING_COOLANT_FLOW, OPERATING_STATE, cstr
 from reactorwatch.process.model import Output, ProcessModel, new_clock, variable
 from reactorwatch.process.simulate import Simulator
+from tests.unit.kalman.plant import SENSORS, record_of
 
 A = np.array([[-0.7, 0.4], [-0.9, -0.3]])
 B = np.array([0.5, 1.0])
 C = np.array([[1.0, 0.0], [0.5, -1.0]])
 NOISE = NoiseLevels((0.1, 0.2), (0.05, 0.3))
-SENSORS = NoiseLevels((0.002, 0.3), (0.0, 0.0))
 BURN_IN = 50
 
 
@@ -98,22 +96,15 @@ def first_state(model: ProcessModel, noise: NoiseLevels = NOISE) -> FilterState:
 
 
 def test_on_a_linear_model_it_is_the_kalman_filter_exactly_sampled() -> None:
+    """Its likelihood is that of the innovations, and normalising takes their correlation out."""
     time_min, inputs, measured = linear_record()
-    start = first_state(linear_model())
+    start, expected = first_state(linear_model()), 0.0
     found = Filter(linear_model(), NOISE).run(FilterRecord(time_min[1:], inputs[1:], measured[1:]), start=start)
     for row, (x, P, off, S) in enumerate(textbook(start, time_min[1:], inputs[1:], measured[1:])):
         np.testing.assert_allclose(found.x[row], x, rtol=1e-6, atol=1e-6)
         np.testing.assert_allclose(found.P[row], P, rtol=1e-6, atol=1e-9)
         np.testing.assert_allclose(found.residual[row], off, atol=1e-6)
         np.testing.assert_allclose(found.sd[row], np.sqrt(np.diag(S)), rtol=1e-7)
-
-
-def test_its_likelihood_is_that_of_the_innovations_and_whitening_takes_their_correlation_out() -> None:
-    time_min, inputs, measured = linear_record()
-    start = first_state(linear_model())
-    found = Filter(linear_model(), NOISE).run(FilterRecord(time_min[1:], inputs[1:], measured[1:]), start=start)
-    expected = 0.0
-    for row, (_, _, off, S) in enumerate(textbook(start, time_min[1:], inputs[1:], measured[1:])):
         known = np.isfinite(off)
         np.testing.assert_array_equal(np.isfinite(found.normalized[row]), known)
         if known.any():
@@ -133,11 +124,6 @@ def test_its_covariance_settles_at_the_solution_of_the_riccati_equation() -> Non
     np.testing.assert_allclose(P, (np.eye(2) - gain @ C) @ prior, rtol=1e-6)
 
 
-def record_of(config: PlantConfig, rows: int) -> tuple[Array, Array, Array]:
-    record = simulate_record(config, rows)
-    return record.time_min, record.columns["qc"], np.column_stack([record.columns["C"], record.columns["T"]])
-
-
 def assert_white(normalized: Array) -> None:
     """Sums of squares are within the 1e-4 quantiles of chi-square; nothing correlates over time or across (4 sd)."""
     rows = len(normalized)
@@ -153,7 +139,7 @@ def assert_white(normalized: Array) -> None:
 @pytest.mark.parametrize("process_sd", [{}, {"C": 0.002, "T": 0.5}])
 def test_on_the_plant_its_innovations_are_white(process_sd: dict[str, float]) -> None:
     noise = NoiseLevels((0.002, 0.3), (process_sd.get("C", 0.0), process_sd.get("T", 0.0)))
-    record = record_of(PlantConfig(seed=5, process_noise_sd=process_sd), 3000)
+    record = record_of(3000, seed=5, process_noise_sd=process_sd)
     assert_white(Filter(cstr(), noise).run(FilterRecord(*record)).normalized[BURN_IN:])
 
 
@@ -167,8 +153,7 @@ def test_on_the_plant_its_innovations_are_white(process_sd: dict[str, float]) ->
     ],
 )
 def test_with_the_true_fault_in_the_model_the_innovations_of_a_faulty_plant_are_white(fault: str) -> None:
-    config = PlantConfig(seed=6, scenario={"kind": "random-steps", "low": 85.0, "high": 105.0}, faults=(fault,))
-    record = record_of(config, 2000)
+    record = record_of(2000, seed=6, scenario={"kind": "random-steps", "low": 85.0, "high": 105.0}, faults=(fault,))
     assert_white(Filter(parse_fault(fault).extend(cstr()), SENSORS).run(FilterRecord(*record)).normalized[BURN_IN:])
     nominal = Filter(cstr(), SENSORS).run(FilterRecord(*record)).normalized[BURN_IN:]
     assert np.sum(nominal**2) > chi2.isf(1e-4, nominal.size)
@@ -205,7 +190,7 @@ def test_a_record_at_once_and_row_by_row_are_the_same_to_the_last_bit() -> None:
         "feed_flow:step:0.01@15.06min",
     ):
         model = parse_fault(fault).extend(model)
-    time_min, inputs, measured = record_of(PlantConfig(seed=7), 300)
+    time_min, inputs, measured = record_of(300, seed=7)
     time_min = time_min + np.where(np.arange(300) > 200, 2.0, 0.0) + np.where(np.arange(300) > 250, 40.0, 0.0)
     measured[50, 0] = np.nan
     measured[60] = np.nan
@@ -225,32 +210,21 @@ def test_a_record_at_once_and_row_by_row_are_the_same_to_the_last_bit() -> None:
 
 
 @pytest.mark.parametrize("since", [1, 100, 129, 299])
-def test_over_the_rest_of_a_record_it_resumes_bit_for_bit(since: int) -> None:
-    time_min, inputs, measured = record_of(PlantConfig(seed=7), 300)
+def test_from_a_stored_state_it_resumes_bit_for_bit(since: int) -> None:
+    time_min, inputs, measured = record_of(300, seed=7)
     time_min = time_min + np.where(np.arange(300) > 200, 2.0, 0.0)
     model = parse_fault("coolant_flow:step:-0.2@12.37min").extend(cstr())
     record = FilterRecord(time_min, inputs, measured, 6.0)
     whole, kalman = Filter(model, SENSORS).run(record), Filter(model, SENSORS)
     kalman.run(FilterRecord(time_min[:since], inputs[:since], measured[:since], gate=6.0))
-    rest = kalman.run(FilterRecord(time_min[since:], inputs[since:], measured[since:], 6.0), kalman.state)
+    stored = msgspec.msgpack.decode(msgspec.msgpack.encode(kalman.state), type=FilterState)
+    rest = Filter(model, SENSORS).run(FilterRecord(time_min[since:], inputs[since:], measured[since:], 6.0), stored)
     for field in Innovation._fields:
         np.testing.assert_array_equal(getattr(rest, field), getattr(whole, field)[since:])
 
 
-def test_from_a_stored_state_it_resumes_bit_for_bit() -> None:
-    time_min, inputs, measured = record_of(PlantConfig(seed=8), 100)
-    one, other = Filter(cstr(), SENSORS), Filter(cstr(), SENSORS)
-    one.run(FilterRecord(time_min[:60], inputs[:60], measured[:60]))
-    stored = msgspec.msgpack.encode(one.state)
-    other.state = msgspec.msgpack.decode(stored, type=FilterState)
-    for row in range(60, 100):
-        arguments = (float(time_min[row]), (float(inputs[row]),), measured[row].tolist())
-        assert one.update(*arguments) == other.update(*arguments)
-    assert one.state == other.state
-
-
 def test_a_value_beyond_the_gate_is_treated_as_missing_until_it_is_accepted() -> None:
-    time_min, inputs, measured = record_of(PlantConfig(seed=9), 60)
+    time_min, inputs, measured = record_of(60, seed=9)
     outlier, missing = measured.copy(), measured.copy()
     outlier[50, 1], missing[50, 1] = outlier[50, 1] + 10.0, np.nan
     accept = np.zeros((60, 2), dtype=bool)
@@ -338,39 +312,24 @@ def test_where_the_equations_leave_all_bounds_or_explode_it_restarts_at_once() -
         assert kalman.state.x == pytest.approx((1.0, -0.5), abs=1e-2)
 
 
-def test_a_run_may_end_where_the_filter_diverges_instead_of_restarting() -> None:
-    """The rows before are those of a filter that restarts, and no search for an initial state is charged."""
+def test_a_run_may_end_at_the_first_divergence_or_after_several_instead_of_restarting() -> None:
+    """The rows before are those of a filter that restarts."""
     model = linear_model(bound=50.0)
     time_min, inputs, measured = linear_record(rows=60)
     inputs[30:] = 1e6  # leads out of the bounds
     record = FilterRecord(time_min, inputs, measured)
-    kalman, stopping = Filter(model, NOISE), Filter(model, NOISE)
-    stopping.stops_at_restart = True
-    restarted, stopped = kalman.run(record), stopping.run(record)
-    end = int(np.argmax(np.isnan(restarted.prediction[1:, 0]))) + 1
-    assert 30 <= end < 60
-    for one, other in zip(restarted, stopped, strict=True):
-        np.testing.assert_array_equal(one[:end], other[:end])
-        assert np.all(np.isnan(other[end:]))
-    assert np.all(np.isfinite(restarted.x[end]))
-
-
-def test_a_run_that_diverges_often_ends_after_the_divergences_that_it_may_have() -> None:
-    model = linear_model(bound=50.0)
-    time_min, inputs, measured = linear_record(rows=60)
-    inputs[30:] = 1e6  # leads out of the bounds
-    record = FilterRecord(time_min, inputs, measured)
-    results = []
-    for most in (3, np.inf):
-        kalman = Filter(model, NOISE)
-        kalman.most_divergences = most
-        results.append(kalman.clone().run(record))
-    stopped, restarted = results
+    stopping, several = Filter(model, NOISE), Filter(model, NOISE)
+    stopping.stops_at_restart, several.most_divergences = True, 3
+    restarted = Filter(model, NOISE).run(record)
+    first = int(np.argmax(np.isnan(restarted.prediction[1:, 0]))) + 1
+    assert 30 <= first < 60
+    assert np.all(np.isfinite(restarted.x[first]))
     started = np.isnan(restarted.prediction[:, 0]) & np.isfinite(restarted.x[:, 0])
-    end = int(np.flatnonzero(started)[4])  # after the first row and three divergences
-    assert np.all(np.isnan(stopped.x[end:]))
-    for one, other in zip(restarted, stopped, strict=True):
-        np.testing.assert_array_equal(one[:end], other[:end])
+    fourth = int(np.flatnonzero(started)[4])  # after the first row and three divergences
+    for end, kalman in ((first, stopping), (fourth, several.clone())):
+        for one, other in zip(restarted, kalman.run(record), strict=True):
+            np.testing.assert_array_equal(one[:end], other[:end])
+            assert np.all(np.isnan(other[end:]))
 
 
 def test_a_correction_is_cut_off_at_the_bounds() -> None:

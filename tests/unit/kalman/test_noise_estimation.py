@@ -3,23 +3,17 @@
 import numpy as np
 import pytest
 
-from plant_node.config import PlantConfig
-from plant_node.record import simulate_record
 from reactorwatch.arrays import Array
 from reactorwatch.kalman.batch import FilterRecord
 from reactorwatch.kalman.ekf_step import NoiseLevels
 from reactorwatch.kalman.noise_estimation import fit_noise
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import cstr
+from tests.unit.kalman.plant import record_of
 
 SMALLEST = (2e-4, 0.05)
 ROWS = 1000
 SD_ERROR = 4 / np.sqrt(2 * ROWS)
 """Four standard errors of a standard deviation from so many normal values, relative."""
-
-
-def record_of(rows: int = ROWS, **settings: object) -> tuple[Array, Array, Array]:
-    record = simulate_record(PlantConfig(**settings), rows)  # type: ignore[arg-type] # settings by name
-    return record.time_min, record.columns["qc"], np.column_stack([record.columns["C"], record.columns["T"]])
 
 
 def estimate(time_min: Array, inputs: Array, measured: Array) -> NoiseLevels:
@@ -30,14 +24,14 @@ def estimate(time_min: Array, inputs: Array, measured: Array) -> NoiseLevels:
 def test_of_a_plant_that_the_model_describes_it_finds_the_sensors_noise_and_no_other(
     noise_sd: dict[str, float],
 ) -> None:
-    found = estimate(*record_of(seed=1, noise_sd=noise_sd))
+    found = estimate(*record_of(ROWS, seed=1, noise_sd=noise_sd))
     np.testing.assert_allclose(found.measurement_sd, (noise_sd.get("C", 0.002), noise_sd.get("T", 0.3)), rtol=SD_ERROR)
     assert found.process_sd == (0.0, 0.0)
 
 
 def test_it_finds_the_noise_of_the_process_too() -> None:
     """Eight runs scattered by 13 % and 7 % about the truth: three times that is allowed."""
-    found = estimate(*record_of(seed=2, process_noise_sd={"C": 0.002, "T": 0.5}))
+    found = estimate(*record_of(ROWS, seed=2, process_noise_sd={"C": 0.002, "T": 0.5}))
     np.testing.assert_allclose(found.measurement_sd, (0.002, 0.3), rtol=1.3 * SD_ERROR)
     assert found.process_sd[0] == pytest.approx(0.002, rel=0.39)
     assert found.process_sd[1] == pytest.approx(0.5, rel=0.21)
@@ -45,27 +39,27 @@ def test_it_finds_the_noise_of_the_process_too() -> None:
 
 @pytest.mark.parametrize(("state", "sd"), [(0, 0.005), (1, 2.0)])
 def test_it_finds_which_state_is_disturbed(state: int, sd: float) -> None:
-    found = estimate(*record_of(seed=3, process_noise_sd={"CT"[state]: sd}))
+    found = estimate(*record_of(ROWS, seed=3, process_noise_sd={"CT"[state]: sd}))
     assert found.process_sd[state] == pytest.approx(sd, rel=0.15)
     assert found.process_sd[1 - state] == 0.0
 
 
 def test_rows_that_are_far_apart_do_not_mislead_it() -> None:
     """The plant moves by some 5 K from row to row, which is not noise."""
-    found = estimate(*record_of(seed=4, period_min=1.0))
+    found = estimate(*record_of(ROWS, seed=4, period_min=1.0))
     np.testing.assert_allclose(found.measurement_sd, (0.002, 0.3), rtol=SD_ERROR)
     assert found.process_sd == (0.0, 0.0)
 
 
 def test_of_a_record_without_noise_it_returns_the_smallest_levels() -> None:
-    found = estimate(*record_of(seed=5, noise_sd={"C": 0.0, "T": 0.0}))
+    found = estimate(*record_of(ROWS, seed=5, noise_sd={"C": 0.0, "T": 0.0}))
     assert found.measurement_sd == pytest.approx(SMALLEST, rel=1e-9)
     assert found.process_sd == (0.0, 0.0)
 
 
 @pytest.mark.parametrize("process_sd", [{}, {"C": 0.002, "T": 0.5}])
 def test_spikes_in_two_rows_of_a_hundred_change_it_by_less_than_a_tenth(process_sd: dict[str, float]) -> None:
-    time_min, inputs, measured = record_of(seed=6, process_noise_sd=process_sd)
+    time_min, inputs, measured = record_of(ROWS, seed=6, process_noise_sd=process_sd)
     rng = np.random.default_rng(6)
     spiked = measured.copy()
     for column, size in enumerate((0.05, 8.0)):
@@ -76,7 +70,7 @@ def test_spikes_in_two_rows_of_a_hundred_change_it_by_less_than_a_tenth(process_
 
 
 def test_what_is_missing_is_not_missed() -> None:
-    time_min, inputs, measured = record_of(seed=7)
+    time_min, inputs, measured = record_of(ROWS, seed=7)
     measured[np.random.default_rng(7).random(measured.shape) < 0.2] = np.nan
     measured[300:330] = np.nan
     found = estimate(time_min, inputs, measured)
@@ -85,16 +79,11 @@ def test_what_is_missing_is_not_missed() -> None:
 
 
 def test_an_output_that_is_never_measured_has_the_smallest_level() -> None:
-    time_min, inputs, measured = record_of(seed=8)
+    time_min, inputs, measured = record_of(ROWS, seed=8)
     measured[:, 0] = np.nan
     found = estimate(time_min, inputs, measured)
     assert found.measurement_sd[0] == pytest.approx(SMALLEST[0], rel=1e-9)
     assert found.measurement_sd[1] == pytest.approx(0.3, rel=SD_ERROR)
-
-
-def test_it_is_the_same_every_time() -> None:
-    record = record_of(seed=9, process_noise_sd={"T": 0.2})
-    assert estimate(*record) == estimate(*record)
 
 
 @pytest.mark.parametrize("smallest", [(0.0, 0.0), (0.0, 0.05), (1e-300, 1e-300)])
@@ -102,7 +91,7 @@ def test_it_is_the_same_every_time() -> None:
 def test_a_sensor_without_noise_needs_no_smallest_level(
     smallest: tuple[float, float], noise_sd: dict[str, float]
 ) -> None:
-    found = fit_noise(cstr(), FilterRecord(*record_of(rows=400, seed=5, noise_sd=noise_sd)), smallest).levels
+    found = fit_noise(cstr(), FilterRecord(*record_of(400, seed=5, noise_sd=noise_sd)), smallest).levels
     for sd, least, true in zip(
         found.measurement_sd, smallest, (noise_sd.get("C", 0.002), noise_sd.get("T", 0.3)), strict=True
     ):
@@ -114,7 +103,7 @@ def test_a_sensor_without_noise_needs_no_smallest_level(
 
 
 def test_an_output_that_is_always_zero_has_a_level_too() -> None:
-    time_min, inputs, measured = record_of(rows=400, seed=5)
+    time_min, inputs, measured = record_of(400, seed=5)
     measured[:, 0] = 0.0
     found = fit_noise(cstr(), FilterRecord(time_min, inputs, measured), (0.0, 0.0)).levels
     assert np.all(np.isfinite([*found.measurement_sd, *found.process_sd]))

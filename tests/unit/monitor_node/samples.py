@@ -9,12 +9,12 @@ from monitor_node.core import Monitor
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication, encode
 from reactorwatch.contract.messages_pb2 import Quality, Sample
-from reactorwatch.process.library.cstr.effects.coolant_flow import CoolantFlow
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import cstr
 from reactorwatch.process.profiles import STEP
 from reactorwatch.process.simulate import Simulator
 from reactorwatch.records.record import to_time_ns
 from tests.tables import UNITS
+from tests.unit.process.effect_named import effect_of
 
 PLANT = "cstr"
 Rows = NDArray[np.float64]
@@ -26,7 +26,7 @@ def leaking_run(size: float, onset_min: float, span_min: float, seed: int) -> tu
     rows = int(span_min * 10) + 1
     time_min = np.arange(rows) / 10
     qc = np.repeat(generator.uniform(90, 111, rows // 10 + 1), 10)[:rows]
-    model = CoolantFlow().extend(cstr(), STEP)
+    model = effect_of("coolant_flow").extend(cstr(), STEP)
     changes = {"coolant_flow.size": size, "coolant_flow.onset": onset_min}
     outputs = Simulator(model).run(time_min, qc, np.array([0.1, 438.54]), changes).outputs
     outputs = outputs + generator.normal(size=outputs.shape) * (0.002, 0.3)

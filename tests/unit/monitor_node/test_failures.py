@@ -18,7 +18,7 @@ from monitor_node.watch.pipeline import PlantPipeline
 from reactorwatch.contract.codec import Encoded, Publication
 from reactorwatch.contract.messages_pb2 import Health
 from reactorwatch.errors import InputError
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import cstr
 
 from .fleets import QUICK, SECOND_NS, alarms, alone, fleet, of, row_by_row
 

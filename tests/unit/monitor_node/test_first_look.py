@@ -23,7 +23,7 @@ from reactorwatch.kalman import error_dynamics
 from reactorwatch.kalman.batch import STEPS_PER_SEARCH
 from reactorwatch.kalman.ekf_step import compiled_row, predict_function, row_function
 from reactorwatch.kalman.filter_states import correction_function
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import cstr
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.event_loop import EventLoop
 from tests.memory_bus import Exchange, MemoryBus

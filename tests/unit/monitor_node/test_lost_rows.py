@@ -16,7 +16,7 @@ from monitor_node.learn.process_reference import ProcessMemory, ProcessReference
 from reactorwatch.contract.codec import Encoded
 from reactorwatch.contract.messages_pb2 import Alarm, Sample
 from reactorwatch.kalman.ekf import Filter
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import cstr
 from reactorwatch.process.simulate import Simulator
 
 from .faulty import SENSORS, rows_of

@@ -15,7 +15,7 @@ from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication, encode
 from reactorwatch.contract.messages_pb2 import Alarm, Estimate, Incident, Quality, Sample
 from reactorwatch.process import EFFECTS_OF
-from reactorwatch.process.library.three_tanks.model import three_tanks
+from reactorwatch.process.library.three_tanks import three_tanks
 from reactorwatch.process.model import Output, ProcessModel, new_clock, parameter, variable
 from reactorwatch.process.profiles import STEP
 from reactorwatch.process.simulate import Simulator

@@ -16,7 +16,7 @@ from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from reactorwatch.contract.codec import Encoded, encode
 from reactorwatch.contract.messages_pb2 import Alarm, AlarmState, Estimate, Health
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import cstr
 from reactorwatch.process.simulate import Simulator
 from reactorwatch.records.record import to_time_ns
 

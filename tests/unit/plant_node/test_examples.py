@@ -9,7 +9,7 @@ import reactorwatch as rw
 from reactorwatch.cli.examples import make_example
 from reactorwatch.errors import InputError
 from reactorwatch.process import OPERATIONS
-from reactorwatch.process.library.cstr.examples import BOILING_FROM_K
+from reactorwatch.process.library.cstr_operation import BOILING_FROM_K
 
 SEED = 3
 EXAMPLES = [name for item in OPERATIONS.values() for name, example in item.examples.items() if example.law is None]

@@ -11,8 +11,8 @@ import pytest
 from plant_node.config import PlantConfig, ProcessSettings, fit_settings
 from reactorwatch.description.find import DEFAULT_PROCESS, find_process
 from reactorwatch.errors import InputError
-from reactorwatch.process.library.cstr.controllers import LevelControl, TemperatureControl
-from reactorwatch.process.library.cstr.effects import EFFECTS
+from reactorwatch.process.library.cstr import EFFECTS
+from reactorwatch.process.library.cstr_operation import LevelControl, TemperatureControl
 from reactorwatch.runtime.config import read_settings, section
 
 

@@ -15,13 +15,13 @@ from plant_node.record import plant_from, simulate_record
 from plant_node.scenario import FromFile, scenario_settings
 from reactorwatch.errors import InputError
 from reactorwatch.process.fault import parse_fault
-from reactorwatch.process.library.cstr.controllers import GAIN, TemperatureControl
-from reactorwatch.process.library.cstr.model import cstr
-from reactorwatch.process.library.cstr.operation import OPERATION
+from reactorwatch.process.library.cstr import cstr
+from reactorwatch.process.library.cstr_operation import OPERATION, TemperatureControl
 from reactorwatch.runtime.config import section
 from tests.unit.plant_node.reactor import Reactor, coolant_for, resting
 from tests.unit.plant_node.rows import QUIET, column, rows
 
+GAIN = TemperatureControl().gain_l_min_K
 PERIOD_MIN = 0.1
 FLOWS = (85.0, 90.0, 95.0, 100.0, 103.41, 105.0, 108.0, 111.0)
 

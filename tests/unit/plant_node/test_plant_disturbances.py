@@ -15,8 +15,8 @@ from plant_node.instruments import ProcessNoise
 from plant_node.record import plant_from, simulate_record
 from reactorwatch.arrays import Array
 from reactorwatch.errors import InputError
-from reactorwatch.process.library.cstr.controllers import LevelControl
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import cstr
+from reactorwatch.process.library.cstr_operation import LevelControl
 from reactorwatch.process.linearise import linearise
 from reactorwatch.process.model import ProcessModel, variable
 from reactorwatch.process.steady_state import steady_states

@@ -11,8 +11,8 @@ from plant_node.config import PlantConfig
 from plant_node.record import plant_from, simulate_record
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.fault import parse_fault
-from reactorwatch.process.library.cstr.controllers import LevelControl, TemperatureControl
-from reactorwatch.process.library.cstr.effects import EFFECTS
+from reactorwatch.process.library.cstr import EFFECTS
+from reactorwatch.process.library.cstr_operation import LevelControl, TemperatureControl
 from tests.unit.plant_node.reactor import Reactor
 from tests.unit.plant_node.rows import QUIET
 

@@ -12,7 +12,7 @@ from plant_node.record import plant_from
 from reactorwatch.errors import InputError
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.fault import FaultSpecification
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import cstr
 from reactorwatch.process.model import ProcessModel, variable
 from reactorwatch.process.profiles import CONSTANT
 from reactorwatch.process.steady_state import complete_state, start_state

@@ -11,8 +11,8 @@ from plant_node.core import Plant, Row
 from plant_node.record import plant_from
 from reactorwatch.errors import InputError
 from reactorwatch.process.fault import parse_fault
-from reactorwatch.process.library.cstr.controllers import LevelControl, TemperatureControl
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import cstr
+from reactorwatch.process.library.cstr_operation import LevelControl, TemperatureControl
 from tests.unit.plant_node.reactor import Reactor, resting
 from tests.unit.plant_node.rows import QUIET
 

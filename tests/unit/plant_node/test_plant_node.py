@@ -21,7 +21,7 @@ from reactorwatch.contract.messages_pb2 import (
     Sample,
     SetInput,
 )
-from reactorwatch.process.library.cstr.controllers import TemperatureControl
+from reactorwatch.process.library.cstr_operation import TemperatureControl
 from reactorwatch.runtime.event_loop import StopSignal
 from tests.memory_bus import Exchange, MemoryBus
 from tests.running import WITHIN_S, running

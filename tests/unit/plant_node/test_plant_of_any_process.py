@@ -17,7 +17,7 @@ from reactorwatch.description.find import find_process
 from reactorwatch.description.process import Process, Signal
 from reactorwatch.errors import InputError
 from reactorwatch.process import MODELS
-from reactorwatch.process.controller import Controller
+from reactorwatch.process.operation import Controller
 from reactorwatch.process.simulate import Simulator
 from reactorwatch.runtime.config import section
 from tests.unit.plant_node.rows import column, rows

@@ -13,8 +13,8 @@ from reactorwatch.cli.main import app
 from reactorwatch.description.find import find_process
 from reactorwatch.errors import InputError
 from reactorwatch.process.fault import parse_fault
-from reactorwatch.process.library.cstr.model import cstr
-from reactorwatch.process.library.cstr.operation import ONSET_MIN, OPERATION
+from reactorwatch.process.library.cstr import cstr
+from reactorwatch.process.library.cstr_operation import ONSET_MIN, OPERATION
 from reactorwatch.process.steady_state import steady_states
 from reactorwatch.records.record import Record
 from reactorwatch.runtime.config import BusConfig, section

@@ -20,8 +20,8 @@ from plant_node.scenario import (
     scenario_settings,
 )
 from reactorwatch.errors import InputError
-from reactorwatch.process.library.cstr.model import cstr
-from reactorwatch.process.library.cstr.operation import OPERATION
+from reactorwatch.process.library.cstr import cstr
+from reactorwatch.process.library.cstr_operation import OPERATION
 from reactorwatch.records.record import Record
 
 TIMES = np.round(np.arange(3000) * 0.1, 9)

@@ -1,8 +1,7 @@
 """An effect of the reactor's catalogue by its name, and a model with it."""
 
 from reactorwatch.process.effect import Effect
-from reactorwatch.process.library.cstr.effects import EFFECTS
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import EFFECTS, cstr
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.profiles import CONSTANT, STEP
 

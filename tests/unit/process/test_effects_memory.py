@@ -5,7 +5,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from reactorwatch.arrays import Array
-from reactorwatch.process.library.cstr.model import OPERATING_STATE
+from reactorwatch.process.library.cstr import OPERATING_STATE
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.simulate import Simulator
 from tests.unit.process import by_hand

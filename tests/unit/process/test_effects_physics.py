@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from reactorwatch.arrays import Array
-from reactorwatch.process.library.cstr.level_control import with_level_control
-from reactorwatch.process.library.cstr.model import OPERATING_STATE, cstr
+from reactorwatch.process.library.cstr import OPERATING_STATE, cstr
+from reactorwatch.process.library.cstr_operation import LevelControl
 from reactorwatch.process.profiles import RAMP
 from reactorwatch.process.simulate import Simulator
 from tests.unit.process.by_hand import duty, run
@@ -56,7 +56,7 @@ def test_volume(size: float) -> None:
 
 
 def test_volume_with_a_level_of_its_own_is_where_the_level_comes_to_rest() -> None:
-    model = extend_cstr("volume", 0.1, with_level_control(cstr()))
+    model = extend_cstr("volume", 0.1, LevelControl().extend(cstr()))
     states = Simulator(model).run(TIMES, FLOWS, np.array([*START, 110.0])).states
     truth = run(lambda t, x, qc: reactor(x, qc, V=110), START, TIMES, FLOWS)
     assert np.all(np.abs(states[:, :2] - truth) < ERROR)

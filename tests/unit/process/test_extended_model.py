@@ -8,7 +8,7 @@ import pytest
 from reactorwatch.errors import InputError
 from reactorwatch.process.extended_model import ExtendedModel, extended_model_of, parse_extended_model
 from reactorwatch.process.fault import parse_fault
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import cstr
 from reactorwatch.process.simulate import Simulator
 
 FAULTS = (

@@ -5,11 +5,10 @@ import pytest
 
 from reactorwatch.errors import InputError
 from reactorwatch.process.fault import parse_fault
-from reactorwatch.process.library.cstr.effects import EFFECTS
-from reactorwatch.process.library.cstr.effects.coolant_flow import CoolantFlow
-from reactorwatch.process.library.cstr.model import OPERATING_STATE, cstr
+from reactorwatch.process.library.cstr import EFFECTS, OPERATING_STATE, cstr
 from reactorwatch.process.profiles import STEP
 from reactorwatch.process.simulate import Simulator
+from tests.unit.process.effect_named import effect_of
 
 
 @pytest.mark.parametrize(
@@ -153,7 +152,7 @@ def test_extended_model_holds_the_values_and_runs_like_the_effect() -> None:
         "coolant_flow.size": -0.05,
         "coolant_flow.onset": 2.0,
     }
-    by_hand = Simulator(CoolantFlow().extend(cstr(), STEP))
+    by_hand = Simulator(effect_of("coolant_flow").extend(cstr(), STEP))
     expected = by_hand.run(times, flows, start, {"coolant_flow.size": -0.05, "coolant_flow.onset": 2.0})
     np.testing.assert_array_equal(Simulator(model).run(times, flows, start).states, expected.states)
 

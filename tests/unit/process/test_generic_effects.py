@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import replace
 
+import casadi as ca
 import numpy as np
 import pytest
 from hypothesis import given
@@ -10,14 +11,21 @@ from hypothesis import strategies as st
 
 from reactorwatch.process import EFFECTS_OF, MODELS, effects_of, named_effects
 from reactorwatch.process.effect import Effect
-from reactorwatch.process.effect_states import reset_function
-from reactorwatch.process.effect_twins import EffectChanges, add_generic, are_twins, hidden_sources
-from reactorwatch.process.generic_effects import generic_effects, reference_point
-from reactorwatch.process.library.cstr.effects.temperature_bias import TemperatureBias
-from reactorwatch.process.library.three_tanks.model import three_tanks
+from reactorwatch.process.generic import (
+    EffectChanges,
+    add_generic,
+    are_twins,
+    generic_effects,
+    hidden_sources,
+    reference_point,
+)
+from reactorwatch.process.library.three_tanks import three_tanks
 from reactorwatch.process.model import Output, ProcessModel, new_clock, parameter, variable
+from reactorwatch.process.signal_effects import OutputBias
+from reactorwatch.process.simulate import reset_function
 from reactorwatch.units import conversion
 from tests.unit.diagnosis.linear_tank import tank
+from tests.unit.process.effect_named import effect_of
 
 of_every_model = pytest.mark.parametrize("make", [*MODELS, tank], ids=lambda make: str(make.__name__))
 
@@ -89,14 +97,15 @@ def test_a_generic_effect_is_replaced_by_one_of_the_process_that_does_the_same(
 
 
 def test_a_twin_is_known_by_what_it_does_not_by_its_name_or_unit() -> None:
-    class Warm(TemperatureBias):
-        name = "warm"
+    class Warm(OutputBias):
+        name, location, output = "warm", "temperature_sensor", "T"
+        label, unit, lower, upper, typical = "other", "hK", -1.0, 1.0, 0.02
 
-        def reading(self, value, size):  # type: ignore[no-untyped-def]
-            return value + 0.01 * size
+        def sense(self, model: ProcessModel, value: ca.SX, size: ca.SX) -> tuple[ProcessModel, ca.SX]:
+            return model, value + 100.0 * size
 
     model = MODELS[0]()
-    one, other = (EffectChanges(model, effect) for effect in (Warm(), TemperatureBias()))
+    one, other = (EffectChanges(model, effect) for effect in (Warm(), effect_of("temperature_bias")))
     assert are_twins(one, other)
     assert not any(
         are_twins(one, EffectChanges(model, effect))

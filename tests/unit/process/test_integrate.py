@@ -8,12 +8,11 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from reactorwatch.codegen.array_function import ArrayFunction
-from reactorwatch.process.integrate import SimulationError, Stepper, step_grid, symbolic_step
-from reactorwatch.process.library.cstr.effects.coolant_flow import CoolantFlow
-from reactorwatch.process.library.cstr.effects.heat_transfer import HeatTransfer
-from reactorwatch.process.library.cstr.model import OPERATING_STATE, cstr
+from reactorwatch.process.library.cstr import OPERATING_STATE, cstr
 from reactorwatch.process.profiles import STEP
+from reactorwatch.process.simulate import SimulationError, Stepper, step_grid, symbolic_step
 from tests.unit.process.by_hand import nominal
+from tests.unit.process.effect_named import effect_of
 
 
 def test_observed_order_is_five() -> None:
@@ -55,7 +54,11 @@ def test_stepper_finds_its_way_through_an_ignition() -> None:
 
 def test_stepper_does_not_step_across_an_onset() -> None:
     """One advance over an onset is the same as two that meet there."""
-    model = CoolantFlow().extend(cstr(), STEP).with_values({"coolant_flow.size": -0.3, "coolant_flow.onset": 0.0371})
+    model = (
+        effect_of("coolant_flow")
+        .extend(cstr(), STEP)
+        .with_values({"coolant_flow.size": -0.3, "coolant_flow.onset": 0.0371})
+    )
     stepper, u, p = Stepper(model), np.array([100.0]), model.values()
     whole = stepper.advance(np.array(OPERATING_STATE), u, p, 0.0, 0.1)
     parts = stepper.advance(stepper.advance(np.array(OPERATING_STATE), u, p, 0.0, 0.0371), u, p, 0.0371, 0.1)
@@ -91,23 +94,10 @@ def test_grid_ends_a_step_at_every_sample_and_breakpoint() -> None:
     np.testing.assert_array_equal(grid.row, np.searchsorted(time_min, grid.start_min + 1e-9) - 1)
 
 
-def test_refined_grid_covers_the_same_time() -> None:
-    grid = step_grid(np.array([0.0, 0.1, 0.2]), np.array([0.1]))
-    fine = grid.refine({1: grid.length_min[1] * np.array([0.25, 0.75]), 3: grid.length_min[3] * np.array([0.5, 0.5])})
-    assert fine.length_min.size == grid.length_min.size + 2
-    np.testing.assert_allclose(fine.start_min[1:], np.cumsum(fine.length_min)[:-1], atol=1e-15)
-    np.testing.assert_allclose((fine.start_min + fine.length_min)[fine.end_of_row], [0.1, 0.2], atol=1e-15)
-    # the parts of a stretch add up to it, cut or not
-    for of_grid in (grid, fine):
-        assert np.isfinite(of_grid.share).all()
-        assert of_grid.share[of_grid.target == 0].sum() == pytest.approx(1.0)
-        assert of_grid.share[of_grid.origin == 0].sum() == pytest.approx(1.0)
-
-
 def test_two_faults_may_set_in_at_once() -> None:
-    model = HeatTransfer().extend(CoolantFlow().extend(cstr(), STEP), STEP)
+    model = effect_of("heat_transfer").extend(effect_of("coolant_flow").extend(cstr(), STEP), STEP)
     p = model.values({"coolant_flow.onset": 0.03, "heat_transfer.onset": 0.03, "coolant_flow.size": -0.1})
-    only_one = CoolantFlow().extend(cstr(), STEP)
+    only_one = effect_of("coolant_flow").extend(cstr(), STEP)
     expected = Stepper(only_one).advance(
         np.array(OPERATING_STATE),
         np.array([100.0]),

@@ -12,7 +12,7 @@ from reactorwatch.errors import InputError
 from reactorwatch.process import MODELS
 from reactorwatch.process.extended_model import extended_model_of, parse_extended_model
 from reactorwatch.process.law import APART, FORMS, LAG, ExtendedLaw, Form
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import cstr
 from reactorwatch.process.model import Place, ProcessModel
 from reactorwatch.process.places import correct, places_of, unit_of, variable_expression
 from reactorwatch.process.simulate import Simulator

@@ -5,8 +5,8 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from reactorwatch.arrays import Array
-from reactorwatch.process.library.cstr.level_control import with_level_control
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import cstr
+from reactorwatch.process.library.cstr_operation import LevelControl
 from reactorwatch.process.simulate import Simulator
 from reactorwatch.process.steady_state import steady_states
 
@@ -17,7 +17,7 @@ START = np.array([0.0882, 441.2])
 
 def test_at_its_set_point_it_is_the_plant_of_constant_volume() -> None:
     constant = Simulator(cstr()).run(TIME_MIN, QC, START).outputs
-    held = Simulator(with_level_control(cstr())).run(TIME_MIN, QC, np.array([*START, 100.0])).outputs
+    held = Simulator(LevelControl().extend(cstr())).run(TIME_MIN, QC, np.array([*START, 100.0])).outputs
     assert np.allclose(held, constant, rtol=1e-9, atol=1e-9)
 
 
@@ -27,7 +27,7 @@ def test_the_faster_the_controller_the_closer_it_comes_to_constant_volume() -> N
     constant = Simulator(cstr()).run(TIME_MIN, QC, START, change).outputs[-1]
     distance = []
     for gain in (5.0, 10.0, 20.0, 40.0):
-        model = with_level_control(cstr(), gain)
+        model = LevelControl(gain).extend(cstr())
         rest = 100.0 - 3.0 / gain
         held = Simulator(model).run(TIME_MIN, QC, np.array([*START, rest]), change).outputs[-1]
         distance.append(np.abs(held - constant))
@@ -36,14 +36,14 @@ def test_the_faster_the_controller_the_closer_it_comes_to_constant_volume() -> N
 
 
 def test_the_level_rests_where_a_proportional_controller_leaves_it() -> None:
-    model = with_level_control(cstr(), 5.0).with_values({"q": 90.0})
+    model = LevelControl(5.0).extend(cstr()).with_values({"q": 90.0})
     for point in steady_states(model, np.array([95.0])):
         assert point.state[2] == pytest.approx(100.0 - 10.0 / 5.0)
 
 
 def test_it_has_the_steady_states_of_the_plant_of_constant_volume() -> None:
     plain = steady_states(cstr(), np.array([103.41]))
-    held = steady_states(with_level_control(cstr()), np.array([103.41]))
+    held = steady_states(LevelControl().extend(cstr()), np.array([103.41]))
     assert np.allclose([p.state for p in plain], [h.state[:2] for h in held])
     assert [p.stable for p in plain] == [h.stable for h in held]
 
@@ -61,7 +61,7 @@ def test_an_independent_solver_agrees_on_the_balances_of_amounts() -> None:
         return [q * 1.0 - out * C - 7.2e10 * rate, q * 350.0 - out * T + 1.44e13 * rate + duty, q - out]
 
     start = np.array([*START, 110.0])
-    model = with_level_control(cstr(), gain)
+    model = LevelControl(gain).extend(cstr())
     ours = Simulator(model).run(TIME_MIN, np.full(TIME_MIN.size, qc), start, {"q": q}).states
     amounts = [start[0] * start[2], start[1] * start[2], start[2]]
     theirs = solve_ivp(balances, (0, TIME_MIN[-1]), amounts, "LSODA", TIME_MIN, rtol=1e-10, atol=1e-10).y.T
@@ -71,4 +71,4 @@ def test_an_independent_solver_agrees_on_the_balances_of_amounts() -> None:
 
 def test_a_model_without_a_volume_is_refused() -> None:
     with pytest.raises(ValueError, match="has no parameter 'V'"):
-        with_level_control(with_level_control(cstr()))
+        LevelControl().extend(LevelControl().extend(cstr()))

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from reactorwatch.codegen.array_function import ArrayFunction
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import cstr
 from reactorwatch.process.model import parameter
 
 

@@ -5,7 +5,7 @@ import pytest
 from scipy.optimize import brentq
 
 from reactorwatch.arrays import Array
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import cstr
 from reactorwatch.process.linearise import linearise
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.steady_state import SteadyState, steady_states

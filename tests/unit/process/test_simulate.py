@@ -9,12 +9,12 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from reactorwatch.arrays import Array
-from reactorwatch.process.library.cstr.effects.coolant_flow import CoolantFlow
-from reactorwatch.process.library.cstr.model import OPERATING_STATE, cstr
+from reactorwatch.process.library.cstr import OPERATING_STATE, cstr
 from reactorwatch.process.profiles import STEP
 from reactorwatch.process.simulate import Simulator
 from tests.tables import read_csv
 from tests.unit.process.by_hand import nominal
+from tests.unit.process.effect_named import effect_of
 
 START = np.array(OPERATING_STATE)
 
@@ -101,7 +101,7 @@ def test_a_fault_with_an_onset_is_two_runs_that_meet_there(simulator: Simulator)
     time_min = np.sort(np.append(np.arange(80, dtype=np.float64) * 0.1, 3.37))
     onset = int(np.searchsorted(time_min, 3.37))
     flows = np.full(time_min.size, 100.0)
-    faulty = Simulator(CoolantFlow().extend(cstr(), STEP))
+    faulty = Simulator(effect_of("coolant_flow").extend(cstr(), STEP))
     found = faulty.run(
         np.delete(time_min, onset),
         np.delete(flows, onset),

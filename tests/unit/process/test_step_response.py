@@ -5,10 +5,9 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from reactorwatch.arrays import Array
-from reactorwatch.process.library.cstr.model import cstr
-from reactorwatch.process.linearise import linearise
+from reactorwatch.process.library.cstr import cstr
+from reactorwatch.process.linearise import compare_step, linearise, step_response
 from reactorwatch.process.steady_state import steady_states
-from reactorwatch.process.step_response import compare_step, step_response
 
 FLOWS = (85.0, 100.0, 110.0)
 
@@ -38,7 +37,7 @@ def test_the_error_against_the_plant_falls_with_the_square_of_the_step(flow: flo
     point = steady_states(model, u)[-1]
     errors = []
     for step in (0.4, 0.2, 0.1):
-        comparison = compare_step(model, point, u, np.array([step]))
+        comparison = compare_step(model, point.state, u, np.array([step]))
         errors.append(np.abs(comparison.linear - comparison.plant).max(axis=0))
     order = np.log2(np.array(errors[:-1]) / np.array(errors[1:]))
     assert np.all(np.abs(order - 2.0) < 0.1)

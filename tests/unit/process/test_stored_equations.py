@@ -12,8 +12,7 @@ from reactorwatch.process import MODELS, named_effects
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.extended_model import ExtendedModel, parse_extended_model
 from reactorwatch.process.fault import parse_fault
-from reactorwatch.process.fingerprint import fingerprint
-from reactorwatch.process.model import ProcessModel
+from reactorwatch.process.model import ProcessModel, fingerprint
 from reactorwatch.process.stored_equations import BINARY, UNARY, build_equations, store_equations
 from tests.unit.diagnosis.linear_tank import tank
 

@@ -10,8 +10,8 @@ from reactorwatch.arrays import Array
 from reactorwatch.diagnosis.diagnose import diagnose
 from reactorwatch.diagnosis.result import AMBIGUOUS, NAMED, NOMINAL
 from reactorwatch.process.effect import Effect
-from reactorwatch.process.library.three_tanks.effects import THREE_TANKS_EFFECTS
-from reactorwatch.process.library.three_tanks.model import three_tanks
+from reactorwatch.process.library.three_tanks import EFFECTS as THREE_TANKS_EFFECTS
+from reactorwatch.process.library.three_tanks import three_tanks
 from reactorwatch.process.profiles import CONSTANT
 from reactorwatch.process.simulate import Simulator
 from reactorwatch.records.record import Record

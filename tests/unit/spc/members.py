@@ -1,6 +1,6 @@
 """For each chart of the catalogue: one to try, what to feed it, and the run length it should have."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import sqrt
 from typing import Any
@@ -8,19 +8,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from reactorwatch.spc import run_length
-from reactorwatch.spc.charts.cusum import Cusum
+from reactorwatch.spc.charts.cusum import Cusum, cusum_run_length
 from reactorwatch.spc.charts.cva_residual import CvaResidual
-from reactorwatch.spc.charts.ewma import Ewma
-from reactorwatch.spc.charts.mewma import Mewma
+from reactorwatch.spc.charts.ewma import Ewma, ewma_run_length
+from reactorwatch.spc.charts.mewma import Mewma, mewma_run_length
 from reactorwatch.spc.charts.multiple_pca import MultiplePca
 from reactorwatch.spc.charts.multiway_pca import STAGES, MultiwayPca
 from reactorwatch.spc.charts.parameters import ParameterT2
 from reactorwatch.spc.charts.pca import PcaModel, PcaSpe, PcaT2
 from reactorwatch.spc.charts.pls import Pls
 from reactorwatch.spc.charts.residual_space import ResidualSpace
-from reactorwatch.spc.charts.shewhart import Shewhart
-from reactorwatch.spc.charts.t2 import T2
+from reactorwatch.spc.charts.shewhart import Shewhart, shewhart_run_length
+from reactorwatch.spc.charts.t2 import T2, t2_run_length
+from reactorwatch.spc.compiled_chart import OUT, PRESENT, CompiledChart, SignalMemory, X, columns_of, restart_columns
 
 Array = NDArray[np.float64]
 
@@ -29,6 +29,25 @@ MEANS = np.array([438.5, 0.1, 103.4])
 COVARIANCE = np.array([[0.09, 0.001, 0.0], [0.001, 0.0001, 0.002], [0.0, 0.002, 1.0]])
 ROOT = np.linalg.cholesky(COVARIANCE)
 SHIFT = 1.0
+
+
+class Plants:
+    """Charts of one kind, one a plant, updated by their kernel in one call."""
+
+    def __init__(self, charts: Sequence[CompiledChart]) -> None:
+        self.kind = type(charts[0])
+        self.memory = SignalMemory(self.kind.name, np.concatenate([item.memory.numbers for item in charts], axis=1))
+        self.columns = columns_of(self.kind, self.memory)
+
+    def update(self, x: Array, present: NDArray[np.bool_] | bool = True) -> NDArray[np.bool_]:
+        """Next value of every plant that is present; True where its chart is out."""
+        self.columns[X], self.columns[PRESENT] = x, present
+        self.kind.kernel(self.columns)
+        return np.asarray(present & (self.columns[OUT] > 0.0))
+
+    def restart(self, plants: NDArray[np.bool_]) -> None:
+        """Forget the values of the plants that are True."""
+        restart_columns(self.columns, self.kind.memories, plants)
 
 
 @dataclass(frozen=True)
@@ -83,20 +102,20 @@ NEWEST = np.hstack([np.zeros((3, 6)), np.linalg.inv(ROOT)])
 
 MEMBERS: dict[type, Member] = {
     Shewhart: Member(
-        lambda: Shewhart(MEAN, SIGMA, rules=(1, 2, 3, 4)), value, run_length.shewhart(SHIFT, rules=(1, 2, 3, 4))
+        lambda: Shewhart(MEAN, SIGMA, rules=(1, 2, 3, 4)), value, shewhart_run_length(SHIFT, rules=(1, 2, 3, 4))
     ),
-    Cusum: Member(lambda: Cusum(MEAN, SIGMA, 0.5, 4.0, 2.0), value, run_length.cusum(SHIFT, 0.5, 4.0, 2.0)),
+    Cusum: Member(lambda: Cusum(MEAN, SIGMA, 0.5, 4.0, 2.0), value, cusum_run_length(SHIFT, 0.5, 4.0, 2.0)),
     Ewma: Member(
         lambda: Ewma(MEAN, SIGMA, 0.1, 2.8, exact_limits=True),
         value,
-        run_length.ewma(SHIFT, 0.1, 2.8, exact_limits=True),
+        ewma_run_length(SHIFT, 0.1, 2.8, exact_limits=True),
     ),
-    T2: Member(lambda: T2(MEANS, COVARIANCE, 10.0), vector, run_length.t2(SHIFT, 3, 10.0)),
-    Mewma: Member(lambda: Mewma(MEANS, COVARIANCE, 0.2, 11.0), vector, run_length.mewma(SHIFT, 3, 0.2, 11.0)),
+    T2: Member(lambda: T2(MEANS, COVARIANCE, 10.0), vector, t2_run_length(SHIFT, 3, 10.0)),
+    Mewma: Member(lambda: Mewma(MEANS, COVARIANCE, 0.2, 11.0), vector, mewma_run_length(SHIFT, 3, 0.2, 11.0)),
     ParameterT2: Member(
         lambda: ParameterT2(["a1", "b1", "c"], np.linalg.inv(ROOT), 10.0, np.eye(3)[1:]),
         difference,
-        run_length.t2(SHIFT, 3, 10.0),
+        t2_run_length(SHIFT, 3, 10.0),
     ),
     PcaT2: Member(lambda: PcaT2(MODEL), related, 20.0),
     PcaSpe: Member(lambda: PcaSpe(MODEL), related, 20.0),
@@ -108,7 +127,7 @@ MEMBERS: dict[type, Member] = {
             limit=float(np.cbrt(10.0 / 3.0)),
         ),
         vector,
-        run_length.t2(SHIFT, 3, 10.0) + 2.0,
+        t2_run_length(SHIFT, 3, 10.0) + 2.0,
     ),
     Pls: Member(  # all three signals are white scores, so nothing is left for SPE
         lambda: Pls(
@@ -128,7 +147,7 @@ MEMBERS: dict[type, Member] = {
             limit=float(np.cbrt(10.0 / 3.0)),
         ),
         vector,
-        run_length.t2(SHIFT, 3, 10.0),
+        t2_run_length(SHIFT, 3, 10.0),
     ),
     MultiplePca: Member(  # of one regime
         lambda: MultiplePca(
@@ -150,7 +169,7 @@ MEMBERS: dict[type, Member] = {
             limit=float(np.cbrt(10.0 / 3.0)),
         ),
         vector,
-        run_length.t2(SHIFT, 3, 10.0),
+        t2_run_length(SHIFT, 3, 10.0),
     ),
     MultiwayPca: Member(  # whose course is level
         lambda: MultiwayPca(
@@ -170,11 +189,11 @@ MEMBERS: dict[type, Member] = {
             limit=float(np.cbrt(10.0 / 3.0)),
         ),
         lambda rng, rows: np.column_stack([rng.random(rows), vector(rng, rows)]),
-        run_length.t2(SHIFT, 3, 10.0),
+        t2_run_length(SHIFT, 3, 10.0),
     ),
     ResidualSpace: Member(  # of one signal, whose average it is
         lambda: ResidualSpace(["T"], [MEAN], [[sqrt(1.9 / 0.1) / SIGMA]], weight=0.1, limit=2.8),
         lambda rng, rows: value(rng, rows)[:, None],
-        run_length.ewma(SHIFT, 0.1, 2.8),
+        ewma_run_length(SHIFT, 0.1, 2.8),
     ),
 }

@@ -7,7 +7,11 @@ from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 
-from reactorwatch.spc import run_length
+from reactorwatch.spc.charts.cusum import cusum_run_length
+from reactorwatch.spc.charts.ewma import ewma_run_length
+from reactorwatch.spc.charts.mewma import mewma_run_length
+from reactorwatch.spc.charts.shewhart import shewhart_run_length
+from reactorwatch.spc.charts.t2 import t2_run_length
 from tests.unit.spc import published
 
 PAGE = Path(__file__).resolve().parents[3] / "docs" / "charts.md"
@@ -18,17 +22,17 @@ SHIFTS = (0.0, 0.5, 1.0, 2.0, 3.0)
 def rows() -> Iterator[tuple[str, Callable[[float], float], dict[float, float]]]:
     """Each chart: what to call it, its run length by shift, and the published ones."""
     for rules, lengths in published.RUN_RULES.items():
-        yield f"Shewhart, rules {','.join(map(str, rules))}", partial(run_length.shewhart, rules=rules), lengths
+        yield f"Shewhart, rules {','.join(map(str, rules))}", partial(shewhart_run_length, rules=rules), lengths
     for (h, start), lengths in published.CUSUM.items():
         name = f"CUSUM k 0.5, h {h:g}" + (f", head start {start:g}" if start else "")
-        yield name, partial(run_length.cusum, k=0.5, h=h, head_start=start), lengths
+        yield name, partial(cusum_run_length, k=0.5, h=h, head_start=start), lengths
     for (weight, limit), lengths in published.EWMA.items():
-        yield f"EWMA {weight:g}, L {limit:g}", partial(run_length.ewma, weight=weight, limit=limit), lengths
+        yield f"EWMA {weight:g}, L {limit:g}", partial(ewma_run_length, weight=weight, limit=limit), lengths
     for (p, weight, limit), lengths in published.MEWMA.items():
-        computed = partial(run_length.mewma, dimension=p, weight=weight, limit=limit)
+        computed = partial(mewma_run_length, dimension=p, weight=weight, limit=limit)
         yield f"MEWMA p {p}, {weight:g}, H {limit:g}", computed, lengths
     for (p, limit), lengths in published.T2.items():
-        yield f"T2 p {p}, limit {limit:g}", partial(run_length.t2, dimension=p, limit=limit), lengths
+        yield f"T2 p {p}, limit {limit:g}", partial(t2_run_length, dimension=p, limit=limit), lengths
 
 
 def table() -> str:

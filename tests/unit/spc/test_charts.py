@@ -100,40 +100,21 @@ def test_out_means_beyond_a_limit(member: Member) -> None:
 
 
 @pytest.mark.parametrize("kind", COMPILED_CHARTS, ids=lambda chart: chart.name)
-def test_a_bank_gives_the_bits_of_the_single_chart(kind: type[CompiledChart]) -> None:
-    """131 plants, some absent at times, the bank stored and restored on the way: all as each plant alone."""
+def test_charts_of_a_bank_give_the_bits_of_the_single_chart(kind: type[CompiledChart]) -> None:
+    """31 charts, some without a value at times, restarted and stored on the way: all as each by itself."""
     rng = np.random.default_rng(7)
-    singles: list[CompiledChart] = [MEMBERS[kind].new() for _ in range(131)]
-    bank = Bank(singles)
-    for _ in range(60):
-        x, present = value(rng, 131), rng.random(131) < 0.8
-        said = bank.update(np.where(present, x, np.nan), present)
-        for plant, chart in enumerate(singles):
-            if present[plant]:
-                assert tuple(column[plant] for column in said) == chart.update(x[plant])
-            else:
-                assert np.isnan(said.statistic[plant])
-                assert not said.out[plant]
-        bank = Bank.resume(kind, copy_of(bank.memory))
-    assert all(bank.chart(plant).memory.to_bytes() == chart.memory.to_bytes() for plant, chart in enumerate(singles))
-
-
-def test_a_bank_refuses_a_row_as_a_whole() -> None:
-    bank = Bank([Ewma(0.0, 1.0) for _ in range(3)])
-    before = bank.memory.to_bytes()
-    with pytest.raises(ValueError, match="plant 1: a chart takes finite values"):
-        bank.update([1.0, np.nan, 1.0])
-    with pytest.raises(ValueError, match=r"values must have shape \(3,\), got \(2,\)"):
-        bank.update([1.0, 1.0])
-    assert bank.memory.to_bytes() == before
-
-
-def test_a_bank_restarts_the_given_plants() -> None:
-    bank = Bank([Ewma(0.0, 1.0) for _ in range(3)])
-    bank.update([1.0, 2.0, 3.0])
-    bank.restart(np.array([False, True, False]))
-    assert bank.chart(1).memory.to_bytes() == Ewma(0.0, 1.0).memory.to_bytes()
-    assert bank.chart(2).memory.to_bytes() != Ewma(0.0, 1.0).memory.to_bytes()
+    singles: list[CompiledChart] = [MEMBERS[kind].new() for _ in range(31)]
+    bank = Bank.of(singles)
+    for row in range(60):
+        x, present = value(rng, 31), (rng.random(31) < 0.8).tolist()
+        expected = [chart.update(v) if here else None for chart, v, here in zip(singles, x, present, strict=True)]
+        is_out = any(point is not None and point.out for point in expected)
+        judged = bank.judge(np.where(present, x, np.nan).tolist(), present, always=row % 2 == 0)
+        assert judged == (expected if is_out or row % 2 == 0 else None)
+        bank.restart(row % 31)
+        singles[row % 31].restart()
+        bank = Bank(kind, copy_of(bank.memory))
+    assert bank.memory.numbers.T.tolist() == [chart.memory.numbers[:, 0].tolist() for chart in singles]
 
 
 def test_a_memory_of_another_chart_is_refused() -> None:
@@ -147,7 +128,6 @@ def test_a_memory_of_another_chart_is_refused() -> None:
         (lambda: Shewhart(0.0, 0.0), "sigma must be a positive number, got 0.0"),
         (lambda: Shewhart(0.0, 1.0, rules=(1, 5)), r"rules must be some of 1, 2, 3, 4, got \(1, 5\)"),
         (lambda: Ewma(0.0, 1.0, weight=1.5), r"weight \(lambda\) must be in \(0, 1\], got 1.5"),
-        (lambda: Bank([]), "charts must be one or more of one kind"),
     ],
 )
 def test_settings_out_of_range_are_named(new: Any, message: str) -> None:

@@ -14,13 +14,13 @@ from reactorwatch.spc import false_alarm_budget as budget
 from reactorwatch.spc.charts import cusum, ewma, shewhart
 from reactorwatch.spc.charts.base import Judgement
 from reactorwatch.spc.charts.cusum import Cusum
-from reactorwatch.spc.charts.ewma import Ewma
-from reactorwatch.spc.charts.mewma import Mewma
+from reactorwatch.spc.charts.ewma import Ewma, ewma_limit
+from reactorwatch.spc.charts.mewma import Mewma, mewma_limit
 from reactorwatch.spc.charts.shewhart import Shewhart
-from reactorwatch.spc.compiled_chart import Bank, CompiledChart
-from reactorwatch.spc.joint_chart import joint_limit
+from reactorwatch.spc.charts.t2 import joint_limit
+from reactorwatch.spc.compiled_chart import CompiledChart
 from reactorwatch.spc.prewhitening import Prewhitening, learn
-from reactorwatch.spc.run_length.control_limits import ewma_limit, mewma_limit
+from tests.unit.spc.members import Plants
 
 KNOWN = Prewhitening(0.0, (), 1.0, 10**12, 1e-13, 0.0)
 ARL0, TRAINING, WATCHED, PLANTS = 2000.0, 600, 6000, 300
@@ -52,12 +52,12 @@ def trainings(phi: float) -> list[tuple[Prewhitening, np.ndarray]]:
 
 def rate_of_one(charts: list[CompiledChart], e: np.ndarray) -> float:
     """Alarms a row, over charts of many plants; each begins anew after its alarm."""
-    bank, alarms = Bank(charts), 0
+    plants, alarms = Plants(charts), 0
     for values in e.T:
-        out = bank.update(values).out
+        out = plants.update(values)
         if out.any():
             alarms += int(np.count_nonzero(out))
-            bank.restart(out)
+            plants.restart(out)
     return alarms / e.size
 
 
@@ -93,7 +93,12 @@ def test_the_chart_of_all_outputs_alarms_as_often_as_its_share_allows() -> None:
     alarms = rows = 0
     for z in residuals(0.3, seed=2, signals=2)[:50]:
         pairs = [prewhitened(column) for column in z]
-        chart = Mewma([0.0, 0.0], np.eye(2), 0.05, joint_limit(ARL0, 0.05, [item for item, _ in pairs], TRAINING))
+        chart = Mewma(
+            [0.0, 0.0],
+            np.eye(2),
+            0.05,
+            joint_limit(mewma_limit(ARL0, 2, 0.05), 0.05, [item for item, _ in pairs], TRAINING),
+        )
         for values in np.column_stack([e for _, e in pairs]).tolist():
             rows += 1
             if chart.update(values).out:
@@ -123,7 +128,7 @@ def test_a_chart_of_any_number_of_outputs_keeps_its_share(
             e[row] = (lfilter([1.0, *(-a for a in item.coefficients)], [1.0], column) - item.constant) / item.sd
         known = e[:, 6:training]
         white = np.linalg.inv(np.linalg.cholesky(np.corrcoef(known))) @ e[:, training:]
-        limit = joint_limit(arl0, weight, learned, known.shape[1])
+        limit = joint_limit(mewma_limit(arl0, outputs, weight), weight, learned, known.shape[1])
         least_freedom = min(least_freedom, *(0.5 / (item.sd_variance + item.passed_variance) for item in learned))
         first = 0
         while first < rows:
@@ -137,7 +142,9 @@ def test_a_chart_of_any_number_of_outputs_keeps_its_share(
 
 def test_when_all_is_known_limits_are_those_of_the_run_lengths() -> None:
     assert ewma.designed_limit(5000.0, 0.1, KNOWN) == pytest.approx(ewma_limit(5000.0, 0.1), rel=1e-6)
-    assert joint_limit(5000.0, 0.1, [KNOWN, KNOWN], 1e12) == pytest.approx(mewma_limit(5000.0, 2, 0.1), rel=1e-4)
+    assert joint_limit(mewma_limit(5000.0, 2, 0.1), 0.1, [KNOWN, KNOWN], 1e12) == pytest.approx(
+        mewma_limit(5000.0, 2, 0.1), rel=1e-4
+    )
     assert shewhart.designed_width(0.0026997960632602, KNOWN) == pytest.approx(3.0, abs=1e-6)
 
 

@@ -4,11 +4,10 @@ import numpy as np
 import pytest
 from scipy import signal, stats
 
+from reactorwatch.arrays import Array
 from reactorwatch.errors import InputError
-from reactorwatch.spc.charts.base import Array
-from reactorwatch.spc.charts.parameters import ParameterT2
-from reactorwatch.spc.run_length.control_limits import mewma_limit
-from reactorwatch.spc.run_length.parameters import parameter_limit, prepare_limit
+from reactorwatch.spc.charts.mewma import mewma_limit
+from reactorwatch.spc.charts.parameters import ParameterT2, parameter_limit, prepare_limit
 from reactorwatch.stored_state import copy_of
 from tests.unit.spc.members import COVARIANCE, ROOT, difference
 
@@ -99,21 +98,6 @@ def test_a_wrong_number_of_parameters_is_refused() -> None:
         chart().update([0.1, 0.1, 0.1], [1.0] * 4)
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ((NAMES, np.eye(2), 16.0), "root must be rows of 3 finite numbers, one a parameter"),
-        ((NAMES, [], 16.0), "root must have a row for each direction that is charted, got none"),
-        ((NAMES, np.eye(3), 0.0), "limit must be a positive number, got 0.0"),
-        ((NAMES, np.eye(3), 16.0, np.eye(2)), "inputs must be rows of 3 finite numbers"),
-        ((NAMES, np.eye(3), 16.0, None, 1.0), r"forgetting must be in \(0, 1\), got 1.0"),
-    ],
-)
-def test_settings_out_of_range_are_named(arguments: tuple[object, ...], message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        ParameterT2(*arguments)  # type: ignore[arg-type]
-
-
 def test_a_damaged_memory_is_refused() -> None:
     memory = chart().memory
     memory.excitation = np.array([[1.0, 0.0]])
@@ -180,7 +164,7 @@ def test_what_is_prepared_is_not_computed_again(monkeypatch: pytest.MonkeyPatch)
     def fail(*_: object) -> float:
         raise AssertionError("computed again")
 
-    monkeypatch.setattr("reactorwatch.spc.run_length.parameters.mewma", fail)
+    monkeypatch.setattr("reactorwatch.spc.charts.parameters.mewma_run_length", fail)
     assert parameter_limit(1e5, 3, 0.01, 500.0, 0.1) > 0.0
     assert parameter_limit(1e5, 3, 0.02, 500.0, 0.1) == expected
 

@@ -6,12 +6,13 @@ from scipy import special
 from scipy.stats import chi2
 
 from benchmarks.promise.statements import share_worse
-from reactorwatch.spc.baseline import Baseline
+from reactorwatch.spc.charts.base import Baseline
 from reactorwatch.spc.charts.ewma import Ewma
 from reactorwatch.spc.charts.mewma import Mewma
 from reactorwatch.spc.charts.shewhart import Shewhart
+from reactorwatch.spc.charts.t2 import weighted_chi2_tail
+from reactorwatch.spc.false_alarm_budget import TrainingErrors
 from reactorwatch.spc.prewhitening import Prewhitening
-from reactorwatch.spc.training_errors import TrainingErrors, weighted_chi2_tail
 
 ARL0, WEIGHT = 20_000.0, 0.1
 SETTINGS = {"ewma_weight": WEIGHT, "mewma_weight": 0.02}

@@ -8,8 +8,8 @@ import pytest
 
 from reactorwatch.diagnosis.diagnose import diagnose
 from reactorwatch.diagnosis.result import UNKNOWN
-from reactorwatch.process.library.cstr.examples import BOILING_FROM_K, BOILING_RATE, EXAMPLES
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import cstr
+from reactorwatch.process.library.cstr_operation import BOILING_FROM_K, BOILING_RATE, EXAMPLES
 from reactorwatch.process.simulate import Simulator
 from reactorwatch.records.record import Record
 

@@ -19,8 +19,8 @@ from reactorwatch.diagnosis.law.unknown import Unknown, find_laws, fit_places, s
 from reactorwatch.diagnosis.result import SD_95, Law
 from reactorwatch.diagnosis.run import Run
 from reactorwatch.process.law import find_form
-from reactorwatch.process.library.cstr.model import cstr
-from reactorwatch.process.library.three_tanks.model import three_tanks
+from reactorwatch.process.library.cstr import cstr
+from reactorwatch.process.library.three_tanks import three_tanks
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.simulate import Simulator
 

@@ -6,7 +6,7 @@ import pytest
 from monitor_node.alarms.alarms import ChartAlarm
 from reactorwatch.spc.charts.base import Judgement
 from reactorwatch.spc.charts.shewhart import probability_out
-from reactorwatch.spc.m_of_n import false_alarm_rate
+from reactorwatch.spc.run_length import false_alarm_rate
 
 POINTS = {False: Judgement(0.0, 0.0, -3.0, 3.0, False), True: Judgement(5.0, 0.0, -3.0, 3.0, True)}
 

@@ -13,7 +13,7 @@ from reactorwatch.diagnosis.fitting.profiles import FittedProfile, Ramp, Step
 from reactorwatch.kalman.ekf import Filter
 from reactorwatch.kalman.ekf_step import NoiseLevels
 from reactorwatch.process.effect import Effect
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import cstr
 from tests.unit.monitor_node.faulty import ONSET_MIN, SENSORS, rows_of
 
 CAUSES = causes_of(cstr())

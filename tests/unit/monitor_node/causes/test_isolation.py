@@ -13,7 +13,7 @@ from monitor_node.causes.isolation import PROCESS, SENSOR, UNKNOWN, Isolation, c
 from monitor_node.causes.window import Row
 from reactorwatch.kalman.ekf_step import NoiseLevels
 from reactorwatch.process.effect import Effect
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import cstr
 from reactorwatch.process.model import ProcessModel, variable
 from reactorwatch.records.record import MINUTE_NS
 from tests.unit.monitor_node.faulty import ONSET_MIN, SENSORS, rows_of

@@ -19,7 +19,7 @@ from reactorwatch.contract.codec import Encoded
 from reactorwatch.contract.messages_pb2 import Alarm, Incident, Sample
 from reactorwatch.kalman.batch import STEPS_PER_RUN, STEPS_PER_SEARCH, BudgetExceededError, StepBudget
 from reactorwatch.kalman.ekf import Filter
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import cstr
 
 from ..faulty import SENSORS, rows_of
 from ..samples import leaking_run, samples

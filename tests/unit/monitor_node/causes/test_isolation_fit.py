@@ -12,7 +12,7 @@ from monitor_node.causes.window import Window, window_of
 from reactorwatch.diagnosis.fitting.profiles import EndedRamp, FittedProfile, Ramp, Step
 from reactorwatch.kalman.batch import BudgetExceededError, StepBudget
 from reactorwatch.kalman.ekf import Filter
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import cstr
 from tests.unit.monitor_node.faulty import ONSET_MIN, SENSORS, rows_of
 
 CAUSES = causes_of(cstr())

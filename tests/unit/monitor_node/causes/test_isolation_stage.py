@@ -12,7 +12,7 @@ from monitor_node.causes.stage import FEW_ROWS, LOOKS, ROWS_BEFORE, Suspicion, S
 from monitor_node.causes.window import Row
 from monitor_node.config import MonitorConfig
 from monitor_node.learn.references import PlantEquations
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import cstr
 from reactorwatch.stored_state import copy_of
 
 from ..faulty import SENSORS, rows_of

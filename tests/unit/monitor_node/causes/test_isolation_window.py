@@ -10,7 +10,7 @@ from monitor_node.causes.scan import GlrScan
 from monitor_node.causes.window import BURN_IN_ROWS, Row, Window, window_of
 from reactorwatch.kalman.batch import GATE
 from reactorwatch.kalman.ekf import Filter
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import cstr
 from tests.unit.monitor_node.faulty import ONSET_MIN, SENSORS, rows_of
 
 

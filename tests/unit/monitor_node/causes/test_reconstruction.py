@@ -10,7 +10,7 @@ from monitor_node.causes.stage import Reconstruction, ReconstructionMemory
 from monitor_node.causes.window import Row
 from reactorwatch.arrays import Array
 from reactorwatch.kalman.ekf_step import NoiseLevels
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import cstr
 from tests.unit.monitor_node.faulty import ONSET_MIN, SENSORS, rows_of
 
 QUIET = {"C": 0.0, "T": 0.0}

@@ -10,7 +10,7 @@ from monitor_node.causes.window import window_of
 from reactorwatch.cli.examples import make_example
 from reactorwatch.kalman.ekf import Filter
 from reactorwatch.kalman.ekf_step import NoiseLevels
-from reactorwatch.process.library.cascaded_tanks.model import tanks
+from reactorwatch.process.library.cascaded_tanks import tanks
 
 
 @pytest.mark.parametrize("name", ["leak", "cascaded_tanks", "three_tanks"])

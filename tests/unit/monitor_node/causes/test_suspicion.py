@@ -8,7 +8,7 @@ from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from reactorwatch.contract.messages_pb2 import Alarm, Incident, Reconstruction
 from reactorwatch.process.fault import parse_fault
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import cstr
 from reactorwatch.process.simulate import Simulator
 
 from ..samples import Rows, samples

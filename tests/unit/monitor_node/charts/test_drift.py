@@ -6,8 +6,7 @@ from monitor_node.alarms.annunciator import Annunciator
 from monitor_node.charts import drift
 from monitor_node.config import MonitorConfig, ReferenceName
 from monitor_node.learn.arx import JUDGING_FORGETTING, arx_structure
-from reactorwatch.spc.parameter_drift import adaptive_weight
-from reactorwatch.spc.run_length.parameters import parameter_limit
+from reactorwatch.spc.charts.parameters import adaptive_weight, parameter_limit
 
 
 @pytest.mark.parametrize(
@@ -29,7 +28,7 @@ def test_no_limit_is_computed_after_the_preparation(
     def fail(*_: object) -> float:
         raise AssertionError("computed again")
 
-    monkeypatch.setattr("reactorwatch.spc.run_length.parameters.mewma", fail)
+    monkeypatch.setattr("reactorwatch.spc.charts.parameters.mewma_run_length", fail)
     for forgetting in memories:
         assert parameter_limit(1e5, arx_structure(config).parameters, adaptive_weight(forgetting), 500.0, 0.1) > 0.0
 

@@ -14,7 +14,7 @@ from reactorwatch.contract.codec import encode
 from reactorwatch.contract.messages_pb2 import Quality, Sample
 from reactorwatch.description.process import Process, Signal
 from reactorwatch.errors import InputError
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import cstr
 from reactorwatch.records.record import Record
 from recorder.tools.player import samples_of
 

@@ -15,9 +15,9 @@ from monitor_node.learn.process_reference import ProcessReference
 from monitor_node.learn.signal_range import ANY, signal_ranges
 from reactorwatch.contract.codec import Encoded, Publication
 from reactorwatch.contract.messages_pb2 import Alarm, Sample
-from reactorwatch.process.library.cascaded_tanks.model import tanks
-from reactorwatch.process.library.cstr.effects.temperature_bias import TemperatureBias
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cascaded_tanks import tanks
+from reactorwatch.process.library.cstr import cstr
+from tests.unit.process.effect_named import effect_of
 
 from ..samples import leaking_run, samples
 
@@ -135,7 +135,7 @@ def test_a_value_at_a_bound_is_a_measurement(signal: str) -> None:
 def test_without_a_model_and_for_an_output_that_is_no_state_no_range_is_known() -> None:
     """A biased thermometer shows the temperature plus a number, so the bounds of the temperature are not its own."""
     assert signal_ranges(None, SIGNALS) == [ANY] * 3
-    biased = TemperatureBias().extend(cstr())
+    biased = effect_of("temperature_bias").extend(cstr())
     assert [item.is_bounded for item in signal_ranges(biased, SIGNALS)] == [True, True, False]
     assert [item.is_bounded for item in signal_ranges(tanks(), ("u", "x2", "elsewhere"))] == [True, True, False]
     assert isinstance(biased.outputs[1].expression, ca.SX)

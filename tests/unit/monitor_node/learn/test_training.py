@@ -45,7 +45,7 @@ def test_a_plant_that_never_rests_is_watched_after_the_third_training() -> None:
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_moves_of_the_coolant_beyond_those_of_the_training_raise_no_alarm(seed: int) -> None:
     """Trained on 98 to 104 l/min, then run over 88 to 111, with steps and with a ramp."""
-    from reactorwatch.process.library.cstr.model import cstr
+    from reactorwatch.process.library.cstr import cstr
     from reactorwatch.process.simulate import Simulator
 
     generator = np.random.default_rng(seed)

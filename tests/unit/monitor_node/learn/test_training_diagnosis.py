@@ -20,8 +20,8 @@ from reactorwatch.errors import InputError
 from reactorwatch.kalman.ekf_step import row_function
 from reactorwatch.process.extended_model import ExtendedModel
 from reactorwatch.process.fault import parse_fault
-from reactorwatch.process.fingerprint import fingerprint
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import cstr
+from reactorwatch.process.model import fingerprint
 from reactorwatch.records.record import MINUTE_NS
 
 from ..warm_plant import CONFIG, GIVEN, LATE, TRAINED, Run, changes, plant, publish, without_baseline

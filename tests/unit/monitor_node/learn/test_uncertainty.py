@@ -21,7 +21,7 @@ from reactorwatch.diagnosis.result import NOMINAL
 from reactorwatch.kalman.ekf_step import NoiseLevels
 from reactorwatch.kalman.filter_states import is_disturbance
 from reactorwatch.process.extended_model import ExtendedModel
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import cstr
 
 from ..samples import samples
 from ..warm_plant import changes, publish

@@ -14,7 +14,7 @@ from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, encode, encode_message
 from reactorwatch.contract.messages_pb2 import AlarmCommand, Health, ShelveAlarm
 from reactorwatch.errors import InputError
-from reactorwatch.process.library.cstr.model import cstr
+from reactorwatch.process.library.cstr import cstr
 
 from ..samples import PLANT, leaking_run, sample, samples
 

@@ -16,7 +16,7 @@ from reactorwatch.contract.codec import Encoded, Publication, encode
 from reactorwatch.contract.messages_pb2 import Alarm, Estimate, Quality, Sample
 from reactorwatch.description.process import Process, Signal
 from reactorwatch.errors import InputError
-from reactorwatch.process.library.three_tanks.model import three_tanks
+from reactorwatch.process.library.three_tanks import three_tanks
 from reactorwatch.records.record import MINUTE_NS
 from reactorwatch.runtime.config import section
 

@@ -1,1 +1,0 @@
-"""Two tanks, one above the other."""

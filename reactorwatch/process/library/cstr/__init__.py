@@ -1,1 +1,0 @@
-"""The stirred-tank reactor."""

@@ -1,1 +1,0 @@
-"""Three coupled tanks with two pumps."""
