@@ -180,8 +180,8 @@ def read_record(
         plant: name of the plant in a recording; None: the only one in it.
         columns: names of the columns in a table, by signal, where they differ.
         form: what is not to be guessed about a table: `time`, `time_unit`, `time_format`, `dates`, `zone`, `period`,
-            `missing`, `separator`, `decimal`, `header`, `transposed`, `tag`, `value`, `quality_good`, like the options
-            of the commands.
+            `missing`, `separator`, `decimal`, `header`, `transposed`, `tag`, `value`, `sheet`, `quality_good`, like the
+            options of the commands.
 
     Returns:
         The record; `read_as` has the guesses about a table.
@@ -196,6 +196,8 @@ def read_record(
     for name in {"missing", "quality_good"} & form.keys():
         words = (form[name],) if isinstance(form[name], str | float | int) else form[name]
         form[name] = tuple(map(str, words))
+    for name in {"time", "tag", "value", "sheet"} & form.keys():
+        form[name] = form[name] if form[name] is None else str(form[name])
     stated = FileFormat(**form)
     names = dict(columns or {})
     if hasattr(file, "__arrow_c_stream__") or hasattr(file, "__dataframe__"):

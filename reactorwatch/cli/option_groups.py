@@ -26,6 +26,12 @@ class TableOptions:
     time_format: Annotated[
         str | None, Option(help="Format of timestamps, such as '%d.%m.%Y %H:%M:%S' [by their form].")
     ] = None
+    sheet: Annotated[
+        str | None,
+        Option(
+            hidden=True, rich_help_panel="file", help="The sheet of a workbook, by name or number [the first table]."
+        ),
+    ] = None
     dates: Annotated[
         str | None, Option(help="Order in dates such as 03/04/2026, month-first or day-first [by all rows].")
     ] = None

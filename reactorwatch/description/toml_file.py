@@ -40,6 +40,7 @@ class _File(msgspec.Struct, forbid_unknown_fields=True):
     transposed: bool | None = None
     tag: _Column | None = None
     value: _Column | None = None
+    sheet: _Column | None = None
     quality_good: tuple[str | int, ...] = ()
 
 
@@ -65,6 +66,7 @@ _KEYS = {
     "--decimal": "[file] decimal",
     "--tag": "[file] tag",
     "--value": "[file] value",
+    "--sheet": "[file] sheet",
 }
 """Keys by the options that state the same."""
 
@@ -172,8 +174,10 @@ def _file_format(document: _Document) -> FileFormat:
             missing=tuple(str(cell) for cell in document.missing),
             **{
                 **msgspec.structs.asdict(file),
-                "tag": None if file.tag is None else str(file.tag),
-                "value": None if file.value is None else str(file.value),
+                **{
+                    name: None if (given := getattr(file, name)) is None else str(given)
+                    for name in ("tag", "value", "sheet")
+                },
                 "quality_good": tuple(map(str, file.quality_good)),
             },
         )

@@ -35,8 +35,6 @@ _GAPS = re.compile(rf"[+-]?\d{{1,3}}(?:{_GAP}\d{{3}})+(?:[.,]\d+)?")
 """Numbers with thousands in groups, by a sign that is no decimal sign."""
 _FORMS = (_POINT, _COMMA, *_GROUPS_OF.values(), _GAPS)
 _EXPONENT = r"(?:[eE][+-]?\d+)"
-MAX_CELL = 80
-"""Bytes of a cell that holds a number; longer ones are text."""
 
 
 def kind_of(cell: str, missing: frozenset[str] = frozenset(MISSING)) -> str:
@@ -88,7 +86,7 @@ def find_decimal(text: Any, separator: str) -> tuple[str | None, int]:
     known = search(certain.values(), first) if first >= 0 else -1
     if known < 0:
         return "." if first < 0 else None, first
-    cell = text.slice(known, min(MAX_CELL, text.size - known)).to_pybytes().decode(errors="ignore")
+    cell = text.slice(known, min(80, text.size - known)).to_pybytes().decode(errors="ignore")  # longer ones are texts
     return next(sign for sign, form in certain.items() if re.match(form, cell)), first
 
 
@@ -140,18 +138,12 @@ def find_sentinels(missing: frozenset[str]) -> list[float]:
 _CODE = re.compile(r"-9+(\.9+)?|999+|-?(32767|32768|65535|2147483647|2147483648|4294967295|1e\+?\d\d|10{9,14})")
 """Nines, limits of integers, large powers of ten; 99 and 99.9 are values of a saturated input, -9 is any number."""
 
-_FEWEST_OTHERS = 10
-"""Distinct other values; a signal with fewer may be one of modes, or of steps of an actuator."""
-
 
 def describe_sentinels(columns: Mapping[str, Array]) -> list[str]:
     """Notes on the probable sentinels of signals, each with the option that excludes it.
 
     A known code is so far from the other values as these are from each other. Any other value repeats at least three
     times, is 20 times as far and 10 times as large, and none at which sound inputs stand, closed or fully open.
-
-    Args:
-        columns: values by signal, as the file has them; NaN: not measured.
     """
     rows: dict[str, list[str]] = {}
     for name, values in columns.items():
@@ -163,7 +155,7 @@ def describe_sentinels(columns: Mapping[str, Array]) -> list[str]:
         codes = [i for i in repeated if found[i] != -9.0 and _CODE.fullmatch(f"{found[i]:.15g}")]
         for i in repeated:
             value, others = float(found[i]), np.delete(found, [i, *codes])
-            if others.size < _FEWEST_OTHERS:
+            if others.size < 10:  # modes, or the steps of an actuator
                 continue
             low, high = float(others[0]), float(others[-1])
             distance, size = max(low - value, value - high), max(abs(low), abs(high))

@@ -1,20 +1,43 @@
 """Any file of measured data as the bytes of a text table: decompressed, decoded, workbooks and Parquet written out."""
 
 import csv
+import functools
 import gzip
 import io
+import itertools
 import re
 import stat
 import zipfile
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
-from datetime import timedelta
+from datetime import date, datetime, time, timedelta
 from pathlib import Path
 from typing import Any
 
-from reactorwatch.errors import InputError
+from reactorwatch.errors import InputError, hint_at_closest
 from reactorwatch.limits import limits
+
+_FORMULA = re.compile(r"(^|[;\t\r\n])('*)(?=[=+\-@\t\r\uff1d\uff0b\uff0d\uff20])")
+"""Start of what a spreadsheet takes for a formula, in a cell or behind a sign that may separate cells elsewhere."""
+
+
+def quote_formula(text: str) -> str:
+    """Text that a spreadsheet does not take for a formula: a quote before what would be one.
+
+    >>> quote_formula("=1+2"), quote_formula("T-1"), quote_formula("'=1+2")
+    ("'=1+2", 'T-1', "''=1+2")
+    """
+    return _FORMULA.sub(r"\1'\2", text)
+
+
+def unquote_formula(text: str) -> str:
+    """Text before `quote_formula`; another text is unchanged, unless it has such a quote.
+
+    >>> unquote_formula("'=1+2"), unquote_formula("'a'")
+    ('=1+2', "'a'")
+    """
+    return _FORMULA.sub(lambda match: match[1] + match[2][1:], text)
 
 
 @contextmanager
@@ -65,13 +88,13 @@ TABLE_SUFFIXES = (*TEXT_SUFFIXES, *WORKBOOK_SUFFIXES, *PARQUET_SUFFIXES)
 _WIDE = {"utf-16", "utf-16-le", "utf-16-be", "utf-32"}
 """Encodings of several bytes a letter."""
 
-HEAD_BYTES = 4096
-"""Bytes by which the encoding is guessed."""
-
 LARGEST_TEXT = 2_000_000_000
-"""Most bytes of a compressed text: a small file cannot exhaust memory."""
+"""Most bytes of a compressed text or workbook: a small file cannot exhaust memory."""
 
-_MAGIC = {b"\x1f\x8b": "gz", b"PK\x03\x04": "xlsx", b"PAR1": "parquet", b"\x89MCAP": "mcap"}
+_COLUMN, _ROW = re.compile(rb'\br="([A-Z]+)\d'), re.compile(rb'\br="[A-Z]*(\d+)"')
+"""References of cells and rows in a sheet."""
+
+_MAGIC = {b"\x1f\x8b": "gz", b"PK\x03\x04": "xlsx", b"\xd0\xcf\x11\xe0": "xls", b"PAR1": "parquet", b"\x89MCAP": "mcap"}
 _BYTE_ORDER_MARKS = {
     b"\xef\xbb\xbf": "utf-8-sig",
     b"\xff\xfe\0\0": "utf-32",
@@ -86,15 +109,8 @@ def is_table(path: Path) -> bool:
     return path.suffix.lower() in TABLE_SUFFIXES
 
 
-def read_text(path: Path) -> tuple[bytes, list[str]]:
-    r"""Read a file as UTF-8 text with lines that end in \n.
-
-    Returns:
-        The text, and what is unusual about the file.
-
-    Raises:
-        InputError: the file cannot be read, is empty or holds no text.
-    """
+def read_text(path: Path, sheet: str | None = None) -> tuple[bytes, list[str]]:
+    r"""Read a file as UTF-8 text with lines that end in \n."""
     with wrap_read_errors(path):
         try:
             data = path.read_bytes()
@@ -117,12 +133,14 @@ def read_text(path: Path) -> tuple[bytes, list[str]]:
         notes.append("gzip")
         kind = _kind(data)
     if kind == "xlsx":
-        data, sheet = _workbook(path, data)
-        return data, [*notes, f"sheet `{sheet}`"]
+        data, note = _workbook(path, data, sheet)
+        return data, [*notes, note]
+    if kind == "xls":
+        raise InputError(f"{path}: expected a workbook (.xlsx), got an older or an encrypted one; save it as .xlsx")
     if kind == "parquet":
         return _parquet(path, data), [*notes, "Parquet"]
     encoding = next((name for mark, name in _BYTE_ORDER_MARKS.items() if data.startswith(mark)), None)
-    encoding = encoding or _guess_encoding(data[:HEAD_BYTES])
+    encoding = encoding or _guess_encoding(data[:4096])
     if encoding not in _WIDE and b"\0" in data:
         raise InputError(f"{path}: expected a CSV file, got binary data; export the table as .csv")
     if encoding != "utf-8" or not data.isascii():
@@ -159,46 +177,84 @@ def _decode(path: Path, data: bytes, encoding: str) -> tuple[bytes, str]:
     return data.decode("cp1252", errors="replace").encode(), "Windows-1252"
 
 
-def import_openpyxl(path: Path) -> Any:
-    """Import the library for workbooks.
+def _workbook(path: Path, data: bytes, asked: str | None) -> tuple[bytes, str]:
+    """Write a sheet as text: the one that is asked for, or the first that holds a table; and a note on it."""
+    import python_calamine
 
-    Raises:
-        InputError: it is not installed.
-    """
     try:
-        import openpyxl
-    except ImportError as error:
-        raise InputError(f"{path}: workbooks need openpyxl: install reactorwatch[excel], or save it as CSV") from error
-    return openpyxl
-
-
-def _workbook(path: Path, data: bytes) -> tuple[bytes, str]:
-    """Write the first sheet that has rows as text."""
-    openpyxl = import_openpyxl(path)
-    try:
-        book = openpyxl.load_workbook(io.BytesIO(data), read_only=True, data_only=True)
-        for sheet in book.worksheets:
-            rows = [[_cell(value) for value in row] for row in sheet.iter_rows(values_only=True)]
-            width = max(map(len, rows), default=0)  # empty cells at the end of a row may be absent
-            lines = io.StringIO()
-            writer = csv.writer(lines, lineterminator="\n")
-            rows[:1] = [[quote_formula(cell) for cell in row] for row in rows[:1]]  # as in a text that is written here
-            writer.writerows([*row, *[""] * (width - len(row))] for row in rows)
-            if lines.getvalue().strip('", \n'):
-                return lines.getvalue().encode(), str(sheet.title)
-    except (OSError, KeyError, ValueError, zipfile.BadZipFile) as error:
+        book = python_calamine.load_workbook(_unpack_workbook(path, data))
+        kinds = python_calamine.SheetTypeEnum
+        names = [sheet.name for sheet in book.sheets_metadata if sheet.typ == kinds.WorkSheet]
+        if asked is not None:
+            number = int(asked) if asked.isdecimal() else 0
+            if asked not in names and not 1 <= number <= len(names):
+                found = ", ".join(map(repr, names))
+                raise InputError(
+                    f"{path}: expected a sheet {asked!r} (--sheet), got {found}{hint_at_closest(asked, names)}"
+                )
+            names = [asked if asked in names else names[number - 1]]
+        sheets = {name: book.get_sheet_by_name(name).to_python(skip_empty_area=False) for name in names}
+    except (python_calamine.CalamineError, zipfile.BadZipFile, zlib.error, OSError, NotImplementedError) as error:
         raise InputError(f"{path}: expected a workbook (.xlsx), got a damaged or another file: {error}") from error
-    raise InputError(f"{path}: expected a sheet with rows, got an empty workbook")
+    filled = [name for name, rows in sheets.items() if any(cell != "" for row in rows for cell in row)]
+    if not filled:
+        raise InputError(f"{path}: expected a sheet with rows, got an empty {'workbook' if asked is None else 'sheet'}")
+    tables = [name for name in filled if _holds_table(sheets[name])]
+    first, *others = tables or filled
+    rows = [[_cell(value) for value in row] for row in sheets[first]]
+    rows[0] = [quote_formula(cell) for cell in rows[0]]  # as in a text that is written here
+    lines = io.StringIO()
+    csv.writer(lines, lineterminator="\n").writerows(rows)
+    also = f" (--sheet reads {', '.join(f'`{name}`' for name in others)})" if tables and others else ""
+    return lines.getvalue().encode(), f"sheet `{first}`{also}"
+
+
+def _unpack_workbook(path: Path, data: bytes) -> io.BytesIO:
+    """Copy of a workbook without compression, whose sheets fit into memory: the reader of sheets has no limits."""
+    plain, size = io.BytesIO(), 0
+    with zipfile.ZipFile(io.BytesIO(data)) as packed, zipfile.ZipFile(plain, "w") as unpacked:
+        if "xl/workbook.xml" not in packed.namelist():
+            raise InputError(f"{path}: expected a workbook (.xlsx), got another kind of file; save it as .xlsx")
+        for info in packed.infolist():
+            with packed.open(info) as part:
+                content = part.read(LARGEST_TEXT - size + 1)
+            size += len(content)
+            cells = 0
+            if info.filename.startswith("xl/worksheets/"):
+                width = max(map(_column_number, set(_COLUMN.findall(content))), default=0)
+                width = max(width, *(row.count(b"<c") for row in content.split(b"<row")))
+                cells = width * max(map(int, _ROW.findall(content)), default=0)
+            if max(size, cells * 32) > LARGEST_TEXT:  # bytes of a cell in memory, empty or not
+                raise InputError(
+                    f"{path}: expected sheets that unpack to at most {LARGEST_TEXT / 1e9:g} GB, got more in "
+                    f"{info.filename}; delete what is far from the table, split it, or save it as CSV"
+                )
+            unpacked.writestr(info.filename, content)
+    plain.seek(0)
+    return plain
+
+
+def _column_number(letters: bytes) -> int:
+    """Number of a column such as B or AA, from 1."""
+    return functools.reduce(lambda number, letter: 26 * number + letter - 64, letters, 0)
+
+
+def _holds_table(rows: list[list[Any]]) -> bool:
+    """True for a sheet with two rows or more of several cells, of which one is a number or a time."""
+    filled = ([cell for cell in row if cell != ""] for row in rows)
+    values = (len(row) > 1 and any(not isinstance(cell, str) or cell[-1].isdigit() for cell in row) for row in filled)
+    return sum(itertools.islice(filter(None, values), 2)) == 2
 
 
 def _cell(value: object) -> str:
-    if value is None:
-        return ""
+    """Text of a cell; a spreadsheet has no whole numbers, and midnight is a date in it."""
+    if isinstance(value, float):
+        return str(int(value)) if value.is_integer() and abs(value) < 1e16 else repr(value)  # then 1e+16
     if isinstance(value, timedelta):
         return repr(value.total_seconds())
-    if hasattr(value, "isoformat"):
-        return str(value.isoformat())
-    return repr(value) if isinstance(value, float) else str(value)
+    if type(value) is date:
+        value = datetime.combine(value, time())
+    return value.isoformat() if isinstance(value, datetime | time) else str(value)
 
 
 def _parquet(path: Path, data: bytes) -> bytes:
@@ -216,25 +272,3 @@ def _parquet(path: Path, data: bytes) -> bytes:
         reason = str(error).partition("\n")[0]
         raise InputError(f"{path}: expected a Parquet file with columns of plain values: {reason}") from error
     return bytes(text.getvalue())
-
-
-_FORMULA = re.compile(r"(^|[;\t\r\n])('*)(?=[=+\-@\t\r\uff1d\uff0b\uff0d\uff20])")
-"""Start of what a spreadsheet takes for a formula, in a cell or behind a sign that may separate cells elsewhere."""
-
-
-def quote_formula(text: str) -> str:
-    """Text that a spreadsheet does not take for a formula: a quote before what would be one.
-
-    >>> quote_formula("=1+2"), quote_formula("T-1"), quote_formula("'=1+2")
-    ("'=1+2", 'T-1', "''=1+2")
-    """
-    return _FORMULA.sub(r"\1'\2", text)
-
-
-def unquote_formula(text: str) -> str:
-    """Text before `quote_formula`; another text is unchanged, unless it has such a quote.
-
-    >>> unquote_formula("'=1+2"), unquote_formula("'a'")
-    ('=1+2', "'a'")
-    """
-    return _FORMULA.sub(lambda match: match[1] + match[2][1:], text)

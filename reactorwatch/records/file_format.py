@@ -34,6 +34,7 @@ class FileFormat:
         tag: header or number of the column of tags in a table with a row for each value, or several with commas
             between; `none`: each signal has a column (`--tag`).
         value: header or number of the column of values in such a table (`--value`).
+        sheet: name or number (from 1) of the sheet of a workbook (`--sheet`).
         quality_good: qualities of usable values, alone or with commas between; `*`: all (`--quality-good`).
 
     Raises:
@@ -53,6 +54,7 @@ class FileFormat:
     transposed: bool | None = None
     tag: str | None = None
     value: str | None = None
+    sheet: str | None = None
     quality_good: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
@@ -93,11 +95,7 @@ class FileFormat:
 
     @property
     def period_s(self) -> float | None:
-        """Sampling period in seconds; None: the file has a time column.
-
-        Raises:
-            InputError: the text is no period.
-        """
+        """Sampling period in seconds; None: the file has a time column."""
         if self.period is None:
             return None
         match = _PERIOD.fullmatch(self.period.strip())

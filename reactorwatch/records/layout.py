@@ -28,30 +28,12 @@ HEAD_BYTES = 65_536
 HEAD_LINES = 200
 """Lines from which the layout is guessed."""
 
-MIN_LINES = 12
-"""Fewer whole lines in the head are extended: lines of a transposed file are long."""
-
-MIN_TRANSPOSED = 10
-"""Fewest columns of a file without names that may be taken as rows."""
-
-MAX_CELL_LINES = 4
-"""Most lines of a quoted cell in the head."""
-
 _SEPARATORS = ";\t,| "
 _BLANKS = re.compile(rb"[ \t]+")
 
 
 def sniff(path: Path, text: bytes, stated: FileFormat) -> Layout:
-    """Guess the layout of a table.
-
-    Args:
-        path: the file, for messages.
-        text: text of the file, UTF-8.
-        stated: what need not be guessed.
-
-    Raises:
-        InputError: the decimal sign is ambiguous, or the rows have more cells than the header.
-    """
+    """Guess the layout of a table."""
     missing = frozenset((*MISSING, *stated.missing))
     comments = [
         (text.count(b"\n", 0, found.start()) + 1, found[0].decode()) for found in COMMENT.finditer(text, 0, HEAD_BYTES)
@@ -79,14 +61,14 @@ def sniff(path: Path, text: bytes, stated: FileFormat) -> Layout:
 def _head(text: bytes) -> list[tuple[int, str]]:
     """Whole lines at the start of a text, each with its number; lines of one quoted cell are one."""
     size = HEAD_BYTES
-    while text.count(b"\n", 0, size) < MIN_LINES and size < len(text):
+    while text.count(b"\n", 0, size) < 12 and size < len(text):  # lines of a transposed file are long
         size *= 4
     lines = text[:size].decode(errors="ignore").split("\n")
     lines = lines[:HEAD_LINES] if size >= len(text) else lines[:-1][:HEAD_LINES]
     found: list[tuple[int, str]] = []
     row = 0
     while row < len(lines):
-        ends = range(row + 1, min(row + 1 + MAX_CELL_LINES, len(lines)) + 1)
+        ends = range(row + 1, min(row + 5, len(lines)) + 1)  # a cell of a header has a few lines
         end = next((end for end in ends if not "\n".join(lines[row:end]).count('"') % 2), row + 1)
         found.append((end, "\n".join(lines[row:end])))
         row = end
@@ -138,7 +120,7 @@ def _is_unlabelled_by_row(layout: Layout) -> bool:
     if layout.header_row is not None or not layout.sample:
         return False
     width = len(layout.sample[0])
-    if width < MIN_TRANSPOSED or layout.text.count(b"\n") >= width:
+    if width < 10 or layout.text.count(b"\n") >= width:
         return False
     rows = [[kind_of(cell, layout.missing) for cell in cells] for cells in layout.sample]
     if any(kind not in (NUMBER, EMPTY) for kinds in rows for kind in kinds):
@@ -162,26 +144,11 @@ def _transpose(path: Path, text: bytes, separator: str, stated: FileFormat) -> L
     return replace(layout, transposed=True, notes=[*layout.notes, "rows and columns exchanged"])
 
 
-MIN_PLAIN = 3
-"""Fewest different integers below 1,000 beside grouped ones: one or two may stand for "off" or "out of range"."""
-
-LARGEST_STEP = 10.0
-"""Largest factor between neighbours of a column of integers; with a decimal sign, the step is 1,000 times as large."""
-
 _NUMBER = re.compile(rb"[+-]?\d[\d.,]*")
 
 
 class HeaderSearch:
-    """Search for the header and the first row of data.
-
-    Args:
-        path: the file, for messages.
-        text: the whole text.
-        table: lines of its head as cells, each with the number of its line.
-        separator: the character between cells.
-        stated: what need not be guessed.
-        missing: cells that mean "not measured".
-    """
+    """Search for the header and the first row of data."""
 
     def __init__(
         self,
@@ -212,11 +179,7 @@ class HeaderSearch:
         return TEXT in kinds and NUMBER not in kinds and TIME not in kinds
 
     def layout(self, comments: list[tuple[int, str]]) -> Layout:
-        """Layout of the table.
-
-        Args:
-            comments: numbers and texts of the comment lines.
-        """
+        """Layout of the table."""
         table, stated = self._table, self._stated
         has_numbers = self._is_numbered_header(0)
         data = (index for index, (_, cells) in enumerate(table) if self._is_data(cells))
@@ -325,11 +288,7 @@ class HeaderSearch:
         return row - sum(cell.count("\n") for cell in cells)
 
     def _guess_decimal(self, layout: Layout) -> str:
-        """Decimal sign, by all rows.
-
-        Raises:
-            InputError: each sign may be a decimal sign or group thousands.
-        """
+        """Decimal sign, by all rows."""
         body = find_body(layout)
         sign, at = find_decimal(body, layout.separator)
         if sign is None and (group := _find_group_sign(layout)) is not None:
@@ -350,7 +309,8 @@ def _find_group_sign(layout: Layout) -> str | None:
     """Sign that groups thousands in columns of integers; None: there is no evidence.
 
     A column that passes from 963 to 1.007 holds integers: its neighbouring cells with and without the sign are within a
-    factor of `LARGEST_STEP`, and those without it are below 1,000 and differ.
+    factor of 10 (a decimal sign would make it 1,000), and those without it are below 1,000. Three of these differ: one
+    or two may stand for "off" or "out of range".
     """
     import pyarrow.compute as pc
 
@@ -376,7 +336,7 @@ def _find_group_sign(layout: Layout) -> str | None:
         is_plain = point == comma
         plain = np.unique(values[is_plain & (values != 0.0)])
         near = (is_plain[1:] != is_plain[:-1]) & (np.diff(labels[order][filled]) == 0) & (values[1:] * values[:-1] > 0)
-        if plain.size >= MIN_PLAIN and np.abs(plain).max() < 1000 and near.any():
+        if plain.size >= 3 and np.abs(plain).max() < 1000 and near.any():
             steps = np.abs(np.diff(np.log10(np.where(values == 0.0, 1.0, np.abs(values)))))[near]
-            found |= {group} if np.median(steps) < np.log10(LARGEST_STEP) else set()
+            found |= {group} if np.median(steps) < 1.0 else set()
     return found.pop() if len(found) == 1 else None

@@ -81,7 +81,7 @@ def read_table(path: Path, signals: Sequence[SignalColumn] | None = None, stated
         InputError: the file cannot be read, is malformed or can be read in several ways; one line with file, row (as
             a text editor counts), column, rule, value and cure.
     """
-    text, notes = read_text(path)
+    text, notes = read_text(path, stated.sheet)
     layout = sniff(path, text, stated)
     notes = [*notes, *layout.notes]
     asked = [signal.column or signal.name for signal in signals or ()]
@@ -197,7 +197,7 @@ def _sources(
     sources, count = [], Counter(bare)
     for column, name in enumerate(layout.names):
         is_unnamed = layout.header_row is not None and name == str(column + 1)
-        is_unnamed = is_unnamed and (layout.kinds[column] == EMPTY or counts_rows(layout, column))
+        is_unnamed = is_unnamed and (layout.kinds[column] == EMPTY or (column == 0 and counts_rows(layout, column)))
         if column in others or name == RUN_COLUMN or is_unnamed or layout.kinds[column] not in (NUMBER, EMPTY):
             continue
         own = bare[column] if count[bare[column]] == 1 else name
@@ -343,11 +343,7 @@ def filled_rows(times: Times, columns: dict[str, NDArray[np.float64]]) -> NDArra
 
 
 def check_values(table: TextTable, column: int, values: NDArray[np.float64]) -> None:
-    """Check that the values of a column are possible measurements.
-
-    Raises:
-        InputError: one is not.
-    """
+    """Check that the values of a column are possible measurements."""
     if max(np.fmax.reduce(values, initial=0.0), -np.fmin.reduce(values, initial=0.0)) < LARGEST_VALUE:
         return
     row = int(np.flatnonzero(np.abs(values) >= LARGEST_VALUE)[0])

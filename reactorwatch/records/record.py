@@ -223,9 +223,6 @@ def join_files(records: Sequence[Record]) -> Record:
 
     A file continues the last run of the file before it; if it starts before that run's end with other rows than those,
     it starts a new one.
-
-    Raises:
-        InputError: they have different signals or units, or not all have clock time.
     """
     first = records[0]
     if len(records) == 1:
@@ -276,15 +273,6 @@ def join_repeats(
 
     Copies stand below their originals, or are a block that was written again, as where exports overlap. A step back in
     time with other values starts another run, and stays.
-
-    Args:
-        times: times of the rows, shape (rows,).
-        columns: values by signal, each of shape (rows,).
-        runs: number of each row's run, shape (rows,); None: one run.
-        most: largest share of rows whose values may give way to those of a later one; with more, all stay.
-
-    Returns:
-        Indices of the rows that stay, their values, and the numbers of other rows by what became of them.
     """
     every = np.arange(times.size)
     if (times[1:] > times[:-1]).all():

@@ -96,11 +96,7 @@ class Layout:
         return tuple(found)
 
     def rows(self) -> Iterator[tuple[int, list[str]]]:
-        """Yield rows of data, each with the number of its last line; for messages.
-
-        Raises:
-            InputError: a quoted cell has no end.
-        """
+        """Yield rows of data, each with the number of its last line; for messages."""
         lines = self.text.decode().rstrip("\n").split("\n")[self.first_row - 1 :]
         reader = csv.reader((f"{line}\n" for line in lines), delimiter=self.separator, strict=True)
         while True:
@@ -195,16 +191,7 @@ def _to_numpy(cells: Any) -> NDArray[np.float64]:
 
 
 class TextTable:
-    """Columns of a table, by number from 0.
-
-    Args:
-        layout: the table and its layout.
-        numbers: columns to be parsed as numbers.
-        texts: columns to be kept as text.
-
-    Raises:
-        InputError: there are no rows, or one has another number of cells than the header.
-    """
+    """Columns of a table, by number from 0."""
 
     def __init__(self, layout: Layout, numbers: Sequence[int], texts: Sequence[int] = ()) -> None:
         import pyarrow as pa
@@ -255,25 +242,13 @@ class TextTable:
         return self.layout.first_row if is_whole and not self.layout.transposed else None
 
     def select(self, rows: NDArray[np.intp]) -> "TextTable":
-        """Some of the rows.
-
-        Args:
-            rows: indices of the rows, shape (rows of the part,).
-        """
+        """Some of the rows."""
         part = copy(self)
         part._table, part._known, part._chosen = self._table.take(rows), {}, rows
         return part
 
     def numbers(self, column: int, rule: str = "expected a finite number or nothing") -> NDArray[np.float64]:
-        """Numbers in a column, shape (rows,); NaN: not measured.
-
-        Args:
-            column: number of the column.
-            rule: the rule to be named if a cell is no number.
-
-        Raises:
-            InputError: a cell is no number.
-        """
+        """Numbers in a column, shape (rows,); NaN: not measured."""
         if column not in self._known:
             cells = self._table.column(str(column))
             if str(cells.type) == "double":
@@ -295,17 +270,7 @@ class TextTable:
         return self._table.column(str(column)).combine_chunks()
 
     def refuse(self, row: int, column: int, rule: str, cure: str = "") -> NoReturn:
-        """Refuse a cell.
-
-        Args:
-            row: index of the row.
-            column: number of the column.
-            rule: the rule that the cell breaks.
-            cure: what to do about it; `{}` stands for the cell.
-
-        Raises:
-            InputError: always; it names file, row, column, rule, cell and cure.
-        """
+        """Refuse a cell."""
         row = row if self._chosen is None else int(self._chosen[row])
         line, cells = next(item for index, item in enumerate(self.layout.rows()) if index == row)
         at = f"{self.layout.path}, row {line}, column {self.layout.names[column]!r}"

@@ -94,13 +94,7 @@ PATTERNS = (*DATE_TIMES, *DATES, CLOCK)
 
 
 class Instants(NamedTuple):
-    """Parsed timestamps, each of shape (rows,).
-
-    Attributes:
-        local_ns: nanoseconds since 1970 on the clock that was written, or since midnight without a date.
-        offset_s: seconds by which that clock was ahead of UTC; NaN where none is written.
-        valid: False where a cell is no such timestamp.
-    """
+    """Parsed timestamps, each of shape (rows,)."""
 
     local_ns: NDArray[np.int64]
     offset_s: NDArray[np.float64]
@@ -123,11 +117,7 @@ def guess_pattern(cells: list[str], patterns: tuple[Pattern, ...] = PATTERNS) ->
 
 
 def stated_pattern(text: str) -> Pattern:
-    """Pattern of a format in the language of strptime.
-
-    Raises:
-        InputError: a directive is not supported.
-    """
+    """Pattern of a format in the language of strptime."""
     text_in_full = text.replace("%T", "%H:%M:%S").replace("%F", "%Y-%m-%d").replace("%R", "%H:%M")
     regex = ""
     for part in re.findall(r"%.?|[^%]+", text_in_full):

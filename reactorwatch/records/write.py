@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from reactorwatch.errors import InputError
-from reactorwatch.records.decode import PARQUET_SUFFIXES, import_openpyxl, list_files, quote_formula
+from reactorwatch.records.decode import PARQUET_SUFFIXES, list_files, quote_formula
 
 if TYPE_CHECKING:
     from reactorwatch.records.record import Record  # it imports NumPy, and help is to be fast
@@ -56,15 +56,7 @@ def check_output_file(path: Path, sources: Iterable[Path | None] = (), *, force:
 
 
 def check_folder_name(folder: Path, option: str) -> None:
-    """Check that a folder's name is not that of a file.
-
-    Args:
-        folder: path of the folder.
-        option: option of the command line that names it.
-
-    Raises:
-        InputError: it is no folder, or a new one with the suffix of a file.
-    """
+    """Check that a folder's name is not that of a file."""
     if folder.exists():
         if not folder.is_dir():
             kind = "a file" if folder.is_file() else "no folder"
@@ -135,11 +127,7 @@ def file_mode(path: Path) -> int:
 
 
 def refuse_source(path: Path, sources: Iterable[Path | None]) -> None:
-    """Refuse an output that is one of the inputs, under any name.
-
-    Raises:
-        InputError: it is.
-    """
+    """Refuse an output that is one of the inputs, under any name."""
     if not path.exists():
         return
     for source in sources:
@@ -404,7 +392,13 @@ def _write_workbook(path: Path, record: "Record", clock: bool) -> None:
         raise InputError(
             f"{path}: a sheet has at most {MAX_SHEET_ROWS} rows, got {record.rows}; write .parquet or .csv"
         )
-    columns, openpyxl = _columns(record, clock), import_openpyxl(path)
+    try:
+        import openpyxl
+    except ImportError as error:
+        raise InputError(
+            f"{path}: a workbook is written with openpyxl: install reactorwatch[excel], or write .csv"
+        ) from error
+    columns = _columns(record, clock)
     book = openpyxl.Workbook(write_only=True)
     sheet = book.create_sheet("record")
     sheet.append([_text_cell(openpyxl, sheet, path, name) for name in columns])
@@ -437,11 +431,7 @@ def _write_parquet(path: Path, record: "Record", clock: bool) -> None:
 
 
 def write_frame(frame: Any, path: Path) -> Path:
-    """Write a data frame (pandas, polars, Arrow) as a Parquet file; returns its path.
-
-    Raises:
-        InputError: the frame has columns that are no plain values.
-    """
+    """Write a data frame (pandas, polars, Arrow) as a Parquet file; returns its path."""
     import pyarrow as pa
     import pyarrow.parquet
 

@@ -79,8 +79,6 @@ def test_a_compressed_file_has_the_same_bytes_each_time(tmp_path: Path) -> None:
     ],
 )
 def test_a_damaged_file_is_refused_in_one_line(tmp_path: Path, name: str, content: bytes, line: str) -> None:
-    if name.endswith(".xlsx"):
-        pytest.importorskip("openpyxl")
     path = tmp_path / name
     path.write_bytes(content)
     with pytest.raises(InputError, match=line) as refused:
