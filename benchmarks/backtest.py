@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterable
 import numpy as np
 
 from benchmarks.harness.plants import messages_of
+from benchmarks.harness.timing import fastest
 from monitor_node.config import MonitorConfig
 from monitor_node.replay import backtest
 from plant_node.config import PlantConfig
@@ -25,17 +26,6 @@ from reactorwatch.identification.black_box.fit import fit_black_box
 ROWS, SHORT = 50_000, 7500
 REPEATS = 3
 OUTPUTS, TRAINING, WATCHED = 8, 1000, 4000
-
-
-def best_of(run: Callable[[], object]) -> float:
-    """Seconds of the fastest of some repeats, after one that is not counted."""
-    run()
-    seconds = []
-    for _ in range(REPEATS):
-        start = time.perf_counter()
-        run()
-        seconds.append(time.perf_counter() - start)
-    return min(seconds)
 
 
 def decode_all(messages: Iterable[Encoded]) -> int:
@@ -68,17 +58,21 @@ def black_box_row() -> float:
     return 1e6 * min(times)
 
 
+def _seconds(run: Callable[[], object]) -> float:
+    return fastest(run, REPEATS)[0]
+
+
 def main() -> None:
     """Measure and print."""
     record = simulate_record(PlantConfig(seed=1, faults=("coolant_flow:step:-0.1@4500min",)), ROWS)
     messages = messages_of(record)
     sound = messages[: 3 * SHORT]
     result = backtest.run(messages, MonitorConfig())
-    monitor_s = best_of(lambda: backtest.run(messages, MonitorConfig()))
-    blind = best_of(lambda: backtest.run(messages, MonitorConfig(isolation=False)))
-    given = best_of(lambda: backtest.run(messages, MonitorConfig(diagnose_training=False)))
-    short = best_of(lambda: backtest.run(sound, MonitorConfig()))
-    peer = best_of(lambda: decode_all(messages))
+    monitor_s = _seconds(lambda: backtest.run(messages, MonitorConfig()))
+    blind = _seconds(lambda: backtest.run(messages, MonitorConfig(isolation=False)))
+    given = _seconds(lambda: backtest.run(messages, MonitorConfig(diagnose_training=False)))
+    short = _seconds(lambda: backtest.run(sound, MonitorConfig()))
+    peer = _seconds(lambda: decode_all(messages))
     print(f"back-test            {ROWS / monitor_s:10,.0f} rows/s   ({len(result.raised_alarms)} alarms; goal: 20,000)")
     print(f"without isolation    {ROWS / blind:10,.0f} rows/s   (the looks cost {monitor_s - blind:.2f} s)")
     print(f"without diagnosis    {ROWS / given:10,.0f} rows/s   (that of the training costs {monitor_s - given:.2f} s)")

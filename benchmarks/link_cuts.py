@@ -10,8 +10,6 @@ file is read: by the sequence numbers, is anything missing, and is every stream 
 
 import contextlib
 import signal
-import socket
-import subprocess
 import sys
 import tempfile
 import threading
@@ -20,22 +18,32 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from benchmarks.recorder_kills import PATIENCE_S, RATE_PER_S, SIGNALS, Publisher, Tokens
-from reactorwatch.cli.processes import write_settings
+from benchmarks.harness.site import (
+    PATIENCE_S,
+    RATE_PER_S,
+    SIGNALS,
+    Heard,
+    Manner,
+    Proxy,
+    Publisher,
+    Router,
+    Tokens,
+    connect_client,
+    recorder_process,
+)
 from reactorwatch.contract import keys
-from reactorwatch.contract.codec import Encoded, decode
-from reactorwatch.contract.messages_pb2 import Health, Sample
+from reactorwatch.contract.codec import decode
+from reactorwatch.contract.messages_pb2 import Sample
 from reactorwatch.runtime import logs
-from reactorwatch.runtime.bus_zenoh import ZenohBus, connect
+from reactorwatch.runtime.bus_zenoh import ZenohBus
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.event_loop import StopSignal
-from reactorwatch.runtime.loopback import free_endpoint, free_port
+from reactorwatch.runtime.loopback import free_endpoint
 from recorder.__main__ import record
 from recorder.config import RecorderConfig
 from recorder.files.recording import Recording
 
 CUTS_S = (1.0, 5.0, 30.0)
-Manner = Literal["closed", "stalled"]
 Whose = Literal["recorder", "publisher"]
 
 CASES: tuple[tuple[Whose, Manner], ...] = (
@@ -46,142 +54,7 @@ CASES: tuple[tuple[Whose, Manner], ...] = (
 )
 ROWS_PER_S = RATE_PER_S // SIGNALS
 WARM_UP_S = 0.2
-HISTORY_S = 600.0  # a process takes a minute to start where much else runs
 STUCK_S = 7.0  # a publisher that waits for the network waits less
-
-_BLOCK = 65_536
-
-
-class Proxy:
-    """A relay of TCP between this machine's loopback and a router, which can be interrupted."""
-
-    def __init__(self, endpoint: str) -> None:
-        self._target = ("127.0.0.1", int(endpoint.rsplit(":", 1)[1]))
-        self._port = free_port()
-        self.endpoint = f"tcp/127.0.0.1:{self._port}"
-        self._open = threading.Event()
-        self._open.set()
-        self._closed = False
-        self._links: list[socket.socket] = []
-        self._lock = threading.Lock()
-        self._listener = self._listen()
-
-    @contextlib.contextmanager
-    def cut(self, manner: Manner) -> Iterator[None]:
-        """Interrupt it, while the context lasts."""
-        if manner == "stalled":
-            self._open.clear()
-            yield
-            self._open.set()
-            return
-        self._refuse()
-        yield
-        self._listener = self._listen()
-
-    def close(self) -> None:
-        """End it."""
-        self._closed = True
-        self._open.set()
-        self._refuse()
-
-    def _refuse(self) -> None:
-        """Listen no more, and end what is connected."""
-        self._listener.shutdown(socket.SHUT_RDWR)  # a thread that waits for a link holds it open otherwise
-        self._listener.close()
-        self._drop_links()
-
-    def _listen(self) -> socket.socket:
-        listener = socket.create_server(("127.0.0.1", self._port))
-        threading.Thread(target=self._accept, args=(listener,), daemon=True).start()
-        return listener
-
-    def _accept(self, listener: socket.socket) -> None:
-        while True:
-            try:
-                near, _ = listener.accept()
-            except OSError:
-                return  # it is closed
-            try:
-                far = socket.create_connection(self._target)
-            except OSError:
-                near.close()  # the router is gone
-                continue
-            with self._lock:
-                self._links += [near, far]
-            for source, sink in ((near, far), (far, near)):
-                threading.Thread(target=self._relay, args=(source, sink), daemon=True).start()
-
-    def _relay(self, source: socket.socket, sink: socket.socket) -> None:
-        with contextlib.suppress(OSError):
-            while block := source.recv(_BLOCK):
-                self._open.wait()
-                sink.sendall(block)
-        for end in (source, sink):
-            with contextlib.suppress(OSError):
-                end.shutdown(socket.SHUT_RDWR)
-
-    def _drop_links(self) -> None:
-        with self._lock:
-            links, self._links = self._links, []
-        for link in links:
-            with contextlib.suppress(OSError):
-                link.shutdown(socket.SHUT_RDWR)
-            link.close()
-
-
-class Router:
-    """A router in a process of its own, which can be killed."""
-
-    def __init__(self, endpoint: str) -> None:
-        self.config = BusConfig(endpoint=endpoint)
-        self._code = (
-            "from reactorwatch.runtime import bus_zenoh, config; import sys; "
-            f"bus = bus_zenoh.router(config.BusConfig(endpoint={endpoint!r})); sys.stdin.read()"
-        )
-        self._process = self._start()
-
-    @property
-    def pid(self) -> int:
-        """Process ID of the router."""
-        return self._process.pid
-
-    def kill(self) -> None:
-        """End it as a crash does."""
-        self._process.kill()
-        self._process.communicate()
-
-    def restart(self) -> None:
-        """Start another one at the same address."""
-        self._process = self._start()
-
-    def close(self) -> None:
-        """End it."""
-        self.kill()
-
-    def _start(self) -> "subprocess.Popen[bytes]":
-        return subprocess.Popen([sys.executable, "-c", self._code], stdin=subprocess.PIPE, stderr=subprocess.DEVNULL)
-
-
-class Heard:
-    """Counts the messages of others that the recorder has received or reports as lost."""
-
-    def __init__(self, bus: ZenohBus, plant: str = "cstr") -> None:
-        self._changed = threading.Condition()
-        self._count = 0
-        bus.subscribe(keys.key(plant, keys.HEALTH, "recorder"), self._on_health)
-
-    def wait(self, count: int) -> bool:
-        """Wait for a number of messages; False if they did not come in time."""
-        with self._changed:
-            return self._changed.wait_for(lambda: self._count >= count, PATIENCE_S)
-
-    def _on_health(self, message: Encoded) -> None:
-        health = decode(message.payload, message.encoding)
-        assert isinstance(health, Health)
-        with self._changed:
-            own = health.published - 1  # its reports come back to it, but for this one
-            self._count = health.received + health.lost - own
-            self._changed.notify_all()
 
 
 @dataclass(frozen=True)
@@ -241,13 +114,6 @@ def under_load(folder: Path, router: str, whose: Whose | None, cache_messages: i
     load.found.append(read_content([path], publisher))
 
 
-def connect_client(config: BusConfig) -> ZenohBus:
-    """Connect a client to the router."""
-    bus = connect(config, "cuts", StopSignal())
-    assert bus is not None
-    return bus
-
-
 def cut(
     folder: Path,
     whose: Whose,
@@ -295,24 +161,6 @@ def read_content(files: Sequence[Path], publisher: Publisher) -> Found:
     return Found(published, recorded, published - different, recorded - different, behind, publisher.slowest_s)
 
 
-def main() -> None:
-    """Print what was found."""
-    logs.configure()
-    longest_s = float(sys.argv[1]) if len(sys.argv) > 1 else CUTS_S[-1]
-    print(f"{RATE_PER_S:,} samples/s              published   missing  twice  out of order  slowest batch, ms")
-    for span_s in (span for span in CUTS_S if span <= longest_s):
-        cache = round(2 * (span_s + 10.0) * ROWS_PER_S)
-        for whose, manner in CASES:
-            with tempfile.TemporaryDirectory() as folder:
-                _tell(f"{whose}, {manner} {span_s:g} s", cut(Path(folder), whose, manner, span_s, cache_messages=cache))
-        with tempfile.TemporaryDirectory() as folder:
-            _tell(f"router killed {span_s:g} s", kill_router(Path(folder), span_s, cache_messages=cache))
-    with tempfile.TemporaryDirectory() as folder:
-        other, stuck = stick(Path(folder), STUCK_S)
-        _tell(f"beside one stuck {STUCK_S:g} s", other)
-        _tell(f"stuck {STUCK_S:g} s", stuck)
-
-
 def stick(
     folder: Path, span_s: float, *, cache_messages: int = 20_000, rate_per_s: int = RATE_PER_S
 ) -> tuple[Found, Found]:
@@ -334,23 +182,22 @@ def stick(
     return load.found[0], read_content(Recording(stuck).files, load.publisher)
 
 
-@contextlib.contextmanager
-def recorder_process(
-    folder: Path, endpoint: str, tokens: Tokens, plant: str = "cstr"
-) -> Iterator["subprocess.Popen[bytes]"]:
-    """A recorder in a process of its own, which ends by being asked to."""
-    config = RecorderConfig(plant=plant, out=str(folder), health_period_s=0.2, black_box_min=0.0)
-    bus = BusConfig(endpoint=endpoint, history_s=HISTORY_S)
-    write_settings(folder / "settings.toml", {"bus": bus, "recorder": config})
-    tokens.wait(alive=False)
-    command = [sys.executable, "-m", "recorder", str(folder / "settings.toml")]
-    process = subprocess.Popen(command, stderr=subprocess.DEVNULL)
-    try:
-        tokens.wait(alive=True)
-        yield process
-    finally:
-        process.terminate()
-        process.wait(PATIENCE_S)
+def main() -> None:
+    """Print what was found."""
+    logs.configure()
+    longest_s = float(sys.argv[1]) if len(sys.argv) > 1 else CUTS_S[-1]
+    print(f"{RATE_PER_S:,} samples/s              published   missing  twice  out of order  slowest batch, ms")
+    for span_s in (span for span in CUTS_S if span <= longest_s):
+        cache = round(2 * (span_s + 10.0) * ROWS_PER_S)
+        for whose, manner in CASES:
+            with tempfile.TemporaryDirectory() as folder:
+                _tell(f"{whose}, {manner} {span_s:g} s", cut(Path(folder), whose, manner, span_s, cache_messages=cache))
+        with tempfile.TemporaryDirectory() as folder:
+            _tell(f"router killed {span_s:g} s", kill_router(Path(folder), span_s, cache_messages=cache))
+    with tempfile.TemporaryDirectory() as folder:
+        other, stuck = stick(Path(folder), STUCK_S)
+        _tell(f"beside one stuck {STUCK_S:g} s", other)
+        _tell(f"stuck {STUCK_S:g} s", stuck)
 
 
 def _tell(name: str, found: Found) -> None:

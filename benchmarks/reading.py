@@ -8,14 +8,13 @@ single times longer, never shorter. The goal is 4.
 """
 
 import argparse
-import time
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
 
+from benchmarks.harness.timing import fastest
 from reactorwatch.description.find import find_process
 from reactorwatch.description.read import read_process_table
 from reactorwatch.records.record import Record
@@ -51,16 +50,6 @@ def write_stamps(path: Path, record: Record) -> None:
         file.writelines(f"{','.join(map(str, row))}\n" for row in rows)
 
 
-def fastest_s(work: Callable[[], object], repetitions: int) -> float:
-    """Seconds of the fastest of several calls."""
-    times = []
-    for _ in range(repetitions):
-        start = time.perf_counter()
-        work()
-        times.append(time.perf_counter() - start)
-    return min(times)
-
-
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -78,8 +67,8 @@ def main() -> None:
         for path, peer in ((full, full), (short, short), (german, short), (stamps, short)):
             if peer not in peers:
                 load = partial(np.loadtxt, peer, delimiter=",", skiprows=1)
-                peers[peer] = fastest_s(load, arguments.repetitions)
-            ours = fastest_s(partial(read_process_table, path, find_process()), arguments.repetitions)
+                peers[peer], _ = fastest(load, arguments.repetitions)
+            ours, _ = fastest(partial(read_process_table, path, find_process()), arguments.repetitions)
             print(f"{path.stem:8} {ours:7.3f} s  {peers[peer] / ours:5.1f} times numpy.loadtxt of {peer.stem}")
         print(f"goal: {GOAL:g} for full and short")
 

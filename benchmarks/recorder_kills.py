@@ -9,39 +9,43 @@ sample that one file lacks may be in the next one, whose recorder received it fr
     python benchmarks/recorder_kills.py [how many kills]
 """
 
-import contextlib
 import signal
-import subprocess
 import sys
 import tempfile
-import threading
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
+from benchmarks.harness.site import (
+    PATIENCE_S,
+    RATE_PER_S,
+    SIGNALS,
+    CatchUp,
+    Publisher,
+    Tokens,
+    connect_client,
+    recorder_process,
+)
 from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
-from reactorwatch.contract.codec import Encoded, Publication, decode, encode
+from reactorwatch.contract.codec import decode
 from reactorwatch.runtime import logs
-from reactorwatch.runtime.bus_zenoh import ZenohBus, connect, router
+from reactorwatch.runtime.bus_zenoh import router
 from reactorwatch.runtime.config import BusConfig
-from reactorwatch.runtime.event_loop import StopSignal
 from reactorwatch.runtime.loopback import free_endpoint
+from recorder.config import RecorderConfig
 from recorder.files.recording import Recording
 
 KILLS = 50
-RATE_PER_S = 5_000
-SIGNALS = 5
-BATCHES_PER_S = 100
+start_recorder = partial(
+    recorder_process, history_s=BusConfig().history_s, black_box_min=RecorderConfig().black_box_min
+)
+"""The recorder as it is configured by default."""
+
 SOONEST_S, LATEST_S = 0.5, 4.0
-PATIENCE_S = 60.0
-HEALTH_S = 0.2
-LIVE_LAG_MS = 100.0
-LIVE_RATES = 0.8, 1.2
-"""Received of published samples, between two reports of health that are both live: history comes faster."""
 KEPT = 30 * RATE_PER_S // SIGNALS
 """Messages on a key that the publisher remembers: of half a minute, as a busy machine is slow to start a recorder."""
 
@@ -56,137 +60,25 @@ class Killed:
     late: int
 
 
-class Publisher:
-    """Publishes samples at a rate, each with the time at which it was published, until it is closed."""
-
-    def __init__(self, bus: ZenohBus, rate_per_s: int) -> None:
-        self._bus = bus
-        self._rows = rate_per_s // SIGNALS // BATCHES_PER_S
-        self._ended = threading.Event()
-        self._changed = threading.Condition()
-        self.sequence = 0
-        """Sequence number of the next samples."""
-        self.slowest_s = 0.0
-        """The longest that publishing a batch took."""
-        self._thread = threading.Thread(target=self._run)
-        self._thread.start()
-
-    @property
-    def rows_per_s(self) -> int:
-        """Number of rows published in a second."""
-        return self._rows * BATCHES_PER_S
-
-    def wait(self, rows: int) -> None:
-        """Wait until so many rows were published."""
-        with self._changed:
-            assert self._changed.wait_for(lambda: self.sequence >= rows, PATIENCE_S), "nothing is published"
-
-    def close(self) -> None:
-        """Publish no more."""
-        self._ended.set()
-        self._thread.join()
-
-    def _run(self) -> None:
-        due = time.monotonic()
-        while not self._ended.wait(max(0.0, due - time.monotonic())):
-            due += 1.0 / BATCHES_PER_S
-            began = time.monotonic()
-            for _ in range(self._rows):
-                for number in range(SIGNALS):
-                    sample = messages.Sample(
-                        time_ns=time.time_ns(), sequence=self.sequence, value=1.0, quality=messages.QUALITY_GOOD
-                    )
-                    self._bus.publish(encode(Publication(keys.key("cstr", keys.SAMPLE, f"x{number}"), sample)))
-                self.sequence += 1
-            self.slowest_s = max(self.slowest_s, time.monotonic() - began)
-            with self._changed:
-                self._changed.notify_all()
-
-
-class Tokens:
-    """Watches the liveliness token of a recorder."""
-
-    def __init__(self, bus: ZenohBus, plant: str = "cstr") -> None:
-        self._changed = threading.Condition()
-        self._alive = False
-        bus.subscribe_liveliness(keys.key(plant, keys.ALIVE, "recorder"), self._on_token)
-
-    def wait(self, *, alive: bool) -> None:
-        """Wait until the token is there, or gone."""
-        with self._changed:
-            assert self._changed.wait_for(lambda: self._alive == alive, PATIENCE_S), "no recorder, or no end of it"
-
-    def _on_token(self, _key: str, alive: bool) -> None:
-        with self._changed:
-            self._alive = alive
-            self._changed.notify_all()
-
-
-class CatchUp:
-    """Watches the health of a recorder until it has caught up with a publisher."""
-
-    def __init__(self, bus: ZenohBus, rate_per_s: int) -> None:
-        self._changed = threading.Condition()
-        self._rate_per_s = rate_per_s
-        self._before: messages.Health | None = None
-        self._live = 0  # reports in a row
-        bus.subscribe(keys.key("cstr", keys.HEALTH, "recorder"), self._on_health)
-
-    def wait(self) -> None:
-        """Wait until two reports in a row from now on are live."""
-        with self._changed:
-            self._before, self._live = None, 0
-            assert self._changed.wait_for(lambda: self._live >= 2, PATIENCE_S), "the recorder does not catch up"
-
-    def _on_health(self, message: Encoded) -> None:
-        health = decode(message.payload, message.encoding)
-        assert isinstance(health, messages.Health)
-        with self._changed:
-            before, self._before = self._before, health
-            if before is None or health.time_ns <= before.time_ns:
-                return
-            rate_per_s = (health.received - before.received) / ((health.time_ns - before.time_ns) / 1e9)
-            lowest, highest = LIVE_RATES
-            is_live = lowest <= rate_per_s / self._rate_per_s <= highest and health.lag_ms < LIVE_LAG_MS
-            self._live = self._live + 1 if is_live else 0
-            self._changed.notify_all()
-
-
-@contextlib.contextmanager
-def recorder(folder: Path, endpoint: str, tokens: "Tokens") -> Iterator[subprocess.Popen[bytes]]:
-    """A recorder that is alive, after the one before is known to be gone."""
-    settings = folder / "settings.toml"
-    settings.write_text(f'[bus]\nendpoint = "{endpoint}"\n[recorder]\nout = "{folder}"\nhealth_period_s = {HEALTH_S}\n')
-    tokens.wait(alive=False)
-    process = subprocess.Popen([sys.executable, "-m", "recorder", str(settings)], stderr=subprocess.DEVNULL)
-    try:
-        tokens.wait(alive=True)
-        yield process
-    finally:
-        process.kill()
-        process.wait()
-
-
 def kill_often(folder: Path, kills: int, rate_per_s: int, seed: int) -> list[Killed]:
     """Kill a recorder so many times, at random moments, and look at what is there in the end."""
     random = np.random.default_rng(seed)
     config = BusConfig(endpoint=free_endpoint(), cache_messages=KEPT)
     hub = router(config)
-    bus = connect(config, "kills", StopSignal())
-    assert bus is not None
+    bus = connect_client(config)
     tokens = Tokens(bus)  # on the publisher's own link, where the subscription is known before the token
     catch_up = CatchUp(bus, rate_per_s)
     publisher = Publisher(bus, rate_per_s)
     alive_at, killed_ns = [], []
     try:
         for _ in range(kills):
-            with recorder(folder, config.endpoint, tokens) as process:
+            with start_recorder(folder, config.endpoint, tokens) as process:
                 alive_at.append(publisher.sequence + 1)  # the row that is being published may be half heard
                 catch_up.wait()
                 time.sleep(random.uniform(SOONEST_S, LATEST_S))
                 killed_ns.append(time.time_ns())
                 process.send_signal(signal.SIGKILL)
-        with recorder(folder, config.endpoint, tokens) as process:
+        with start_recorder(folder, config.endpoint, tokens) as process:
             catch_up.wait()
             process.terminate()  # the last start recovers, too
             process.wait(PATIENCE_S)

@@ -32,7 +32,7 @@ from typing import Any
 import numpy as np
 import zenoh
 
-from benchmarks.fleet.traffic import (
+from benchmarks.harness.traffic import (
     FLEET,
     KNOWN_ROWS,
     LEARNED_ROWS,

@@ -11,14 +11,13 @@ this record needs. Goal: 80 times faster than the first, at most 1e-6 mol/l and 
 import math
 import sys
 import time
-from collections.abc import Callable
 from itertools import pairwise
-from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
+from benchmarks.harness.timing import fastest
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from reactorwatch.arrays import Array
@@ -27,8 +26,6 @@ from reactorwatch.process.simulate import Simulator
 
 REPEATS = 9
 
-Result = TypeVar("Result")
-
 
 def main(rows: int) -> None:
     """Print the table."""
@@ -36,7 +33,7 @@ def main(rows: int) -> None:
     times, flows = record.time_min, record.columns["qc"]
     start = np.array([record.columns["C"][0], record.columns["T"][0]])
     simulator = Simulator(cstr())
-    ours_s, trajectory = fastest(lambda: simulator.run(times, flows, start))
+    ours_s, trajectory = fastest(lambda: simulator.run(times, flows, start), REPEATS)
     print(f"{rows} rows")
     print(f"  simulation                          {ours_s * 1e3:8.1f} ms")
     changes = np.append(np.flatnonzero(np.diff(flows, prepend=np.nan)), rows - 1)
@@ -47,16 +44,6 @@ def main(rows: int) -> None:
         C, T = np.max(np.abs(states - trajectory.states), axis=0)
         print(f"  LSODA, restarted {where:<19}{theirs_s * 1e3:8.1f} ms", end="")
         print(f"  {theirs_s / ours_s:5.0f} times the simulation; at most {C:.1e} mol/l and {T:.1e} K apart")
-
-
-def fastest(run: Callable[[], Result]) -> tuple[float, Result]:
-    """The least time of several runs after one that compiles, in seconds, and the result."""
-    result, least_s = run(), math.inf
-    for _ in range(REPEATS):
-        began = time.perf_counter()
-        result = run()
-        least_s = min(least_s, time.perf_counter() - began)
-    return least_s, result
 
 
 def lsoda(times: Array, flows: Array, start: Array, edges: NDArray[np.int64]) -> Array:

@@ -19,16 +19,15 @@ from typing import NamedTuple
 
 import msgspec
 
+from benchmarks.harness.plants import messages_of
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from monitor_node.diagnosis_worker import find_deviations
 from monitor_node.replay import backtest
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
-from reactorwatch.contract.codec import encode
 from reactorwatch.contract.messages_pb2 import Incident
 from reactorwatch.records.record import Record
-from recorder.tools.player import samples_of
 
 CONFIG = MonitorConfig()
 ONSET_MIN, AFTER_MIN, SOUND_MIN = 160.0, 30.0, 750.0
@@ -71,7 +70,7 @@ class Outcome(NamedTuple):
 def watch(record: Record, *, diagnosed: bool) -> Outcome:
     """Run the monitor over a record."""
     config = msgspec.structs.replace(CONFIG, diagnose_training=diagnosed)
-    messages = [encode(item) for item in samples_of(record, config.plant)]
+    messages = messages_of(record)
     began_s = time.perf_counter()
     result = backtest.run(messages, config)
     named = [alarm.suspects[0] for alarm, _ in result.raised_alarms if alarm.suspects]
@@ -84,7 +83,7 @@ def watch_live(record: Record) -> tuple[str, float]:
     """First suspect of a live monitor, which gets the finding `LATE_ROWS` after the training, with its probability."""
     monitor = Monitor(CONFIG, 0, points=False)
     found, suspect = -1, ("", 0.0)
-    for message in (encode(item) for item in samples_of(record, CONFIG.plant)):
+    for message in messages_of(record):
         for item in monitor.on_message(message, 0):
             if isinstance(item.message, Incident) and item.message.suspects:
                 suspect = (item.message.suspects[0].cause, item.message.suspects[0].probability)

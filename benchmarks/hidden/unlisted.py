@@ -26,17 +26,21 @@ TRIES, NEAR = 9, 0.25
 """Trials of a size, and the logarithm of the ratio to the wanted strength that will do."""
 
 
+def _plain(states: Array, _size: float) -> Array:
+    return states
+
+
 @dataclass(frozen=True)
 class Unlisted:
     """An effect that is in no catalogue."""
 
     name: str  # name in the tables
-    process: str  # plant in which it acts
     places: tuple[str, ...]  # locations that count as right
     forms: tuple[str, ...]  # forms of a law that count as right
     size: float  # size of a trial; the size of a record is scaled from it
     rates: Rates  # derivatives of the states
-    reading: Reading  # readings of the sensors
+    process: str = "cstr"  # plant in which it acts
+    reading: Reading = _plain  # readings of the sensors
     extra: tuple[float, ...] = ()  # start values of further states
 
 
@@ -117,11 +121,7 @@ def _play(effect: Unlisted, size: float, time_min: Array, inputs: Array) -> Arra
             max_step=0.5,
         )
         states[begin:end], x = solved.y.T[:-1], solved.y[:, -1]
-    return effect.reading(states, size)
-
-
-def _plain(outputs: int) -> Reading:
-    return lambda states, size: states[:, :outputs]
+    return effect.reading(states[:, : len(PLANTS[effect.process].outputs)], size)
 
 
 def _reactor(change: Callable[[float, float, float, float], tuple[float, float]]) -> Rates:
@@ -243,178 +243,142 @@ SMOOTH = ("power", "exponential", "difference", "linear")
 UNLISTED: tuple[Unlisted, ...] = (
     Unlisted(
         "radiation",
-        "cstr",
         REACTOR_ENERGY,
         ("power", "difference", "exponential"),
         5.0,
         _heat(lambda C, T, qc, s: -s * ((T / 440.0) ** 4 - (298.0 / 440.0) ** 4)),
-        _plain(2),
     ),
     Unlisted(
         "reversible reaction",
-        "cstr",
         REACTION,
         ("product", "exponential", "linear", "difference"),
         0.02,
         _second_reaction(lambda C, T, s: -s * exp(-8000.0 * (1.0 / T - 1.0 / 440.0)) * (1.0 - C)),
-        _plain(2),
     ),
     Unlisted(
         "heat capacity grows with T",
-        "cstr",
         REACTOR_ENERGY,
         ("linear", "exponential", "power", "difference"),
         0.1,
         _heavier_when_hot,
-        _plain(2),
     ),
     Unlisted(
         "evaporation above a threshold",
-        "cstr",
         REACTOR_ENERGY,
         ("threshold",),
         0.3,
         _heat(lambda C, T, qc, s: -s * max(T - 441.0, 0.0)),
-        _plain(2),
     ),
     Unlisted(
         "feed preheated by the product",
-        "cstr",
         ("feed", "energy_balance"),
         ("linear", "difference"),
         0.05,
         _preheat_rates,
-        _plain(2),
-        (438.54,),
+        extra=(438.54,),
     ),
     Unlisted(
         "thermocouple curve",
-        "cstr",
         ("temperature_sensor",),
         ("power",),
         0.5,
         NOMINAL_REACTOR,
-        _bend_temperature(lambda T, s: s * ((T - 430.0) / 10.0) ** 2),
+        reading=_bend_temperature(lambda T, s: s * ((T - 430.0) / 10.0) ** 2),
     ),
     Unlisted(
         "second-order side reaction",
-        "cstr",
         REACTION,
         ("power", "product", "exponential"),
         2.0,
         _second_reaction(lambda C, T, s: s * exp(-9000.0 * (1.0 / T - 1.0 / 440.0)) * C * C, heat=120.0),
-        _plain(2),
     ),
     Unlisted(
         "reaction inhibited by A",
-        "cstr",
         REACTION,
         ("saturation", "power", "linear"),
         0.05,
         _second_reaction(lambda C, T, s: _rate(C, T) * (1.0 / (1.0 + s * C / 0.1) - 1.0)),
-        _plain(2),
     ),
     Unlisted(
         "coolant film boils",
-        "cstr",
         ("coolant",),
         ("linear", "exponential", "power", "product", "difference"),
         0.02,
         _heat(lambda C, T, qc, s: -s * _cooling(T, qc) * (T - 435.0) / 10.0),
-        _plain(2),
     ),
     Unlisted(
         "valve with a curve",
-        "cstr",
         ("coolant",),
         ("power", "product"),
         0.02,
         _heat(lambda C, T, qc, s: _cooling(T, qc * (1.0 + s * ((qc - 95.0) / 10.0) ** 2)) - _cooling(T, qc)),
-        _plain(2),
     ),
     Unlisted(
         "A evaporates",
-        "cstr",
         ("mass_balance",),
         ("exponential", "product", "power"),
         0.05,
         _mass(lambda C, T, s: -s * exp(0.06 * (T - 440.0)) * C),
-        _plain(2),
     ),
-    Unlisted(
-        "A crystallises",
-        "cstr",
-        ("mass_balance",),
-        ("threshold",),
-        0.3,
-        _mass(lambda C, T, s: -s * max(C - 0.1, 0.0)),
-        _plain(2),
-    ),
+    Unlisted("A crystallises", ("mass_balance",), ("threshold",), 0.3, _mass(lambda C, T, s: -s * max(C - 0.1, 0.0))),
     Unlisted(
         "analyser saturates",
-        "cstr",
         ("concentration_sensor",),
         ("saturation", "threshold", "power"),
         0.5,
         NOMINAL_REACTOR,
-        _bend_concentration(lambda C, s: -s * np.maximum(C - 0.105, 0.0)),
+        reading=_bend_concentration(lambda C, s: -s * np.maximum(C - 0.105, 0.0)),
     ),
     Unlisted(
-        "thermometer sticks", "cstr", ("temperature_sensor",), (), 1.0, NOMINAL_REACTOR, _bend_temperature(_hysteresis)
+        "thermometer sticks", ("temperature_sensor",), (), 1.0, NOMINAL_REACTOR, reading=_bend_temperature(_hysteresis)
     ),
     Unlisted(
         "stirrer heats when thick",
-        "cstr",
         REACTOR_ENERGY,
         ("exponential", "power", "linear", "difference"),
         5.0,
         _heat(lambda C, T, qc, s: s * exp(8.0 * (C - 0.1))),
-        _plain(2),
     ),
     Unlisted(
         "overflow of tank 2",
-        "three_tanks",
         ("tank2", "pipe20"),
         ("threshold",),
         1.0,
         _flow_into(1, lambda x, u, s: -s * max(x[1] - 16.0, 0.0)),
-        _plain(3),
+        process="three_tanks",
     ),
     Unlisted(
         "laminar pipe beside pipe 13",
-        "three_tanks",
         ("pipe13",),
         ("linear", "power", "difference"),
         0.1,
         _flow_between(0, 2, lambda head, s: s * head),
-        _plain(3),
+        process="three_tanks",
     ),
     Unlisted(
         "pump 1 gives less against the level",
-        "three_tanks",
         ("pump1", "tank1"),
         ("power", "linear", "product"),
         0.02,
         _flow_into(0, lambda x, u, s: -s * u[0] * (x[0] / 40.0) ** 2),
-        _plain(3),
+        process="three_tanks",
     ),
     Unlisted(
         "level 3 reads with a curve",
-        "three_tanks",
         ("h3",),
         ("power",),
         0.5,
         _tanks(lambda *_: (0.0,) * 3),
-        _bent_level,
+        process="three_tanks",
+        reading=_bent_level,
     ),
     Unlisted(
         "pipe 32 chokes",
-        "three_tanks",
         ("pipe32",),
         ("power", "saturation", "linear", "threshold"),
         0.1,
         _flow_between(2, 1, lambda head, s: -s * max(head, 0.0)),
-        _plain(3),
+        process="three_tanks",
     ),
 )
 """Even ones are for tuning, odd ones for judging."""

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from benchmarks.harness.tables import stamp
 from benchmarks.outside import free_run, tennessee, three_tanks, water_circuit
-from benchmarks.outside.table import Row, markdown
+from benchmarks.outside.scores import Row, markdown
 
 SEED = 1
 

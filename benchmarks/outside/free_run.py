@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.outside.command import run
-from benchmarks.outside.table import Row
+from benchmarks.outside.scores import Row
 from reactorwatch.errors import InputError
 
 MODELS = ("arx", "oe", "armax", "bj", "narx", "noe")

@@ -1,7 +1,7 @@
-"""Scores of benchmarks: shares of rows in alarm, and the change-point score of the Numenta benchmark."""
+"""Scores of benchmarks (shares of rows in alarm, the change points of the Numenta benchmark) and their tables."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -110,3 +110,22 @@ def blocks_of(flags: Flags, length: int) -> NDArray[np.float64]:
     """
     count = max(flags.size // length, 1)
     return np.array([float(part.mean()) for part in np.array_split(flags, count)])
+
+
+@dataclass(frozen=True)
+class Row:
+    """A row of a table."""
+
+    method: str  # name of the method
+    settings: str  # settings that it was run with
+    cells: dict[str, str] = field(default_factory=dict)  # values by the name of their column
+
+
+def markdown(rows: Sequence[Row]) -> str:
+    """Rows as a Markdown table; a cell that a row does not have stays empty."""
+    columns = list(dict.fromkeys(name for row in rows for name in row.cells))
+    head = f"| method | settings | {' | '.join(columns)} |\n|---|---|{'---|' * len(columns)}"
+    lines = [
+        f"| {row.method} | {row.settings} | {' | '.join(row.cells.get(name, '') for name in columns)} |" for row in rows
+    ]
+    return "\n".join([head, *lines])

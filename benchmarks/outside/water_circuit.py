@@ -15,8 +15,7 @@ import numpy as np
 
 from benchmarks.outside.command import WatchedRows, backtest
 from benchmarks.outside.peers import Array, Pca
-from benchmarks.outside.scores import Flags, bootstrap_interval, compare_rows, score_change_points
-from benchmarks.outside.table import Row
+from benchmarks.outside.scores import Flags, Row, bootstrap_interval, compare_rows, score_change_points
 
 TRAINING = 400
 WINDOW_S = 60.0

@@ -76,9 +76,8 @@ def print_counts(title: str, plants: Sequence[Plant], outcomes: Iterator[Outcome
     raised = sum(len(item.raised_min) for _, item in found)
     promised, broken = sum_up(item for _, item in found)
     low, high = poisson_interval(raised)
-    print(
-        line("all", f"{raised} (95 %: {low:.1f} to {high:.1f})", f"{promised:.2g}", f"{broken} of {len(found)}"), "\n"
-    )
+    counted = f"{raised} (95 %: {low:.1f} to {high:.1f})"
+    print(line("all", counted, f"{promised:.2g}", f"{broken} of {len(found)}"), end="\n\n")
 
 
 def sum_up(outcomes: Iterable[Outcome]) -> tuple[float, int]:

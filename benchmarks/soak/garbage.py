@@ -14,7 +14,7 @@ import msgspec
 import zenoh
 
 from benchmarks.fuzz import Mutator
-from benchmarks.link_cuts import connect_client
+from benchmarks.harness.site import connect_client
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication, encode, encoding_of
 from reactorwatch.contract.messages_pb2 import Alarm, Quality, Sample

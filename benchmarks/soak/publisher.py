@@ -11,7 +11,7 @@ import time
 
 import msgspec
 
-from benchmarks.link_cuts import connect_client
+from benchmarks.harness.site import connect_client
 from benchmarks.soak.plan import PERIOD_MIN, draw_plan
 from plant_node.node import PlantNode
 from plant_node.record import plant_from

@@ -13,9 +13,9 @@ from typing import Any
 
 import msgspec
 
-from benchmarks.link_cuts import Proxy, Router
+from benchmarks.harness.site import Proxy, Router
 from benchmarks.soak import garbage, publisher
-from benchmarks.soak.memory import Taken, own_memory_mb
+from benchmarks.soak.findings import Taken, own_memory_mb
 from benchmarks.soak.plan import Blow, Plan
 from monitor_node.fleet.config import FleetConfig
 from reactorwatch.cli.processes import write_settings

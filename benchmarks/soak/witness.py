@@ -3,7 +3,7 @@
 import threading
 from collections.abc import Callable
 
-from benchmarks.link_cuts import connect_client
+from benchmarks.harness.site import connect_client
 from benchmarks.soak.site import FLEET, PATIENCE_S
 from monitor_node.health import NODE
 from reactorwatch.contract import keys

@@ -4,48 +4,85 @@ import argparse
 import os
 import sys
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
 
-from reactorwatch.errors import InputError
-from reactorwatch.runtime.crash import guard
+from benchmarks.harness.pool import Pool
+
+if TYPE_CHECKING:
+    from benchmarks.study_figures.figure import Figure, Finding
+
+PAGE = "study.md"
+
+
+class Job(NamedTuple):
+    """A figure to be drawn."""
+
+    key: str  # key of the figure
+    picture: Path  # file of the picture
+    seed: int  # seed of every simulated record
+    data: Path | None = None  # folder of records of others
 
 
 def main(words: Sequence[str] | None = None) -> int:
     """Draw the figures; returns an exit code."""
     # Before NumPy is imported: the last bits of a limit depend on the number of threads.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    return guard("reproduce", partial(_reproduce, _arguments(words)))
-
-
-def _arguments(words: Sequence[str] | None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(prog="reproduce", description="Draw every figure of the original report.")
     parser.add_argument("--out", "-o", type=Path, required=True, help="folder for study.md and its pictures")
     parser.add_argument("--seed", type=int, default=1, help="seed of every simulated record (default: 1)")
     parser.add_argument("--only", help="figures by number, such as 7,12 (default: all)")
-    parser.add_argument("--record", type=Path, help="a record that figures 5, 6, 11 to 16 learn from")
     parser.add_argument("--data", type=Path, help="a folder of records of others, for an entry on measured records")
     parser.add_argument("--jobs", type=int, help="processes (default: one a core)")
-    parser.add_argument("--force", action="store_true", help="replace files that are no text or picture")
-    return parser.parse_args(words)
-
-
-def _reproduce(asked: argparse.Namespace) -> int:
-    from benchmarks.study_figures.reproduce import check_out, reproduce
-    from reactorwatch.api.files import record
-    from reactorwatch.cli.display import print_report
-    from reactorwatch.cli.options import check_recording
-
-    if asked.seed < 0:
-        raise InputError(f"--seed: must be at least 0, got {asked.seed}")
-    if asked.data is not None and not asked.data.is_dir():
-        raise InputError(f"--data {asked.data}: must be a folder of records, and there is none of that name")
-    check_out(asked.out, asked.only, (asked.record, asked.data), data=asked.data, force=asked.force)
-    measured = None if asked.record is None else record(check_recording(asked.record))
-    if measured is not None and measured.runs is not None:
-        raise InputError(f"--record {asked.record}: must be one run, {measured.describe_runs()}; cut one run out of it")
-    print_report(reproduce(asked.out, asked.seed, asked.only, measured, data=asked.data, processes=asked.jobs))
+    asked = parser.parse_args(words)
+    print(reproduce(asked.out, asked.seed, asked.only, data=asked.data, processes=asked.jobs))
     return 0
+
+
+def reproduce(
+    out: Path, seed: int, only: str | None = None, *, data: Path | None = None, processes: int | None = 1
+) -> str:
+    """Write `out`/study.md and its pictures; returns what was written, for people."""
+    from benchmarks.study_figures.catalogue import FOLDER, page
+    from reactorwatch.records.write import atomic_write, fill_folder, make_folder
+
+    figures = _select_figures(only, data)
+    with fill_folder(out) as folder:
+        pictures = make_folder(folder / FOLDER).absolute()
+        jobs = [Job(figure.key, pictures / figure.file_name, seed, data) for figure in figures]
+        found = list(zip(figures, Pool(processes).run("figures", draw, jobs), strict=True))
+        with atomic_write(folder / PAGE) as temporary:
+            temporary.write_text(page(found, seed), encoding="utf-8")
+    lines = [f"  {figure.heading}: {finding.verdict.value}" for figure, finding in found]
+    return "\n".join([f"wrote {out / PAGE} and {len(found)} pictures; the report's claims are:", *lines])
+
+
+def draw(job: Job) -> "Finding":
+    """Draw a figure."""
+    from benchmarks.study_figures.figure import paper
+    from benchmarks.study_figures.study import Study
+
+    (figure,) = (item for item in _entries(job.data) if item.key == job.key)
+    with paper(job.picture, figure.height_px) as drawing:
+        return figure.draw(Study(job.seed), drawing)
+
+
+def _entries(data: Path | None) -> "Sequence[Figure]":
+    from benchmarks.study_figures.catalogue import FIGURES
+    from benchmarks.study_figures.measured_records import measured_figure
+
+    return FIGURES if data is None else (*FIGURES, measured_figure(data))
+
+
+def _select_figures(only: str | None, data: Path | None) -> "Sequence[Figure]":
+    from reactorwatch.errors import InputError, describe_unknown
+
+    keys = {figure.key: figure for figure in _entries(data)}
+    wanted = list(keys) if only is None else [part.strip() for part in only.split(",")]
+    for part in wanted:
+        if part not in keys:
+            raise InputError(f"--only: {describe_unknown('figure', part, keys)}")
+    return [keys[key] for key in keys if key in wanted]
 
 
 if __name__ == "__main__":

@@ -1,23 +1,27 @@
 """Section 3.1: the plant under its proportional controllers of temperature and level."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
 import numpy as np
+from matplotlib.figure import Figure as Drawing
 from scipy.optimize import brentq
 
-from benchmarks.study_figures.canvas import BLACK, BLUE, GREY, ORANGE, SKY, VERMILION, label, legend_below, panels
-from benchmarks.study_figures.figure import Finding
+from benchmarks.study_figures.figure import (
+    BLACK,
+    BLUE,
+    GREY,
+    ORANGE,
+    SKY,
+    VERMILION,
+    Finding,
+    label,
+    legend_below,
+    panels,
+)
 from benchmarks.study_figures.study import NAMES, Study
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from reactorwatch.process.library.cstr import OPERATING_COOLANT_FLOW, OPERATING_STATE
 from reactorwatch.process.library.cstr_operation import LevelControl, TemperatureControl
 from reactorwatch.process.simulate import Simulator
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure as Drawing
 
 GAIN, LEVEL_GAIN = TemperatureControl().gain_l_min_K, LevelControl().gain_per_min
 _SET_POINT_STEP_K = 2.0

@@ -1,17 +1,27 @@
 """Figures 17 to 20: concentration under the report's output-error model, for the four fault records."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
-from typing import TYPE_CHECKING
 
 import msgspec
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure as Drawing
 
-from benchmarks.study_figures.canvas import BLACK, BLUE, GREEN, GREY, ORANGE, VERMILION, label, legend_below, panels
-from benchmarks.study_figures.figure import Finding, Verdict
+from benchmarks.harness.plants import messages_of
+from benchmarks.study_figures.figure import (
+    BLACK,
+    BLUE,
+    GREEN,
+    GREY,
+    ORANGE,
+    VERMILION,
+    Finding,
+    Verdict,
+    label,
+    legend_below,
+    panels,
+)
 from benchmarks.study_figures.report_scheme import WIDTH, ReportChart, chart_output
 from benchmarks.study_figures.study import NAMES, OUTPUTS, TRAINING_ROWS, Study
 from monitor_node.config import MonitorConfig
@@ -19,19 +29,11 @@ from monitor_node.replay import backtest
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from reactorwatch.arrays import Array
-from reactorwatch.contract.codec import encode
 from reactorwatch.process.library.cstr import cstr
 from reactorwatch.process.library.cstr_operation import NOISE_SD, ONSET_MIN, OPERATION
-from reactorwatch.process.operation import Preset
 from reactorwatch.records.record import Record, to_minutes
 from reactorwatch.spc.charts.shewhart import probability_out
-from recorder.tools.player import samples_of
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure as Drawing
-
-_PLANT = "cstr"
 UNITS = cstr().units
 PRESET_OF = dict(zip(("17", "18", "19", "20"), OPERATION.presets, strict=True))
 _SEEDS = 5
@@ -81,17 +83,9 @@ def watch(study: Study, name: str) -> Watch:
     )
 
 
-def draw_record(key: str) -> Callable[[Study, Drawing], Finding]:
-    """Function that draws one of the figures 17 to 20."""
+def draw_record(study: Study, drawing: Drawing, key: str) -> Finding:
+    """One of the figures 17 to 20."""
     preset = PRESET_OF[key]
-
-    def draw(study: Study, drawing: Drawing) -> Finding:
-        return _draw(study, drawing, preset)
-
-    return draw
-
-
-def _draw(study: Study, drawing: Drawing, preset: Preset) -> Finding:
     record, found = study.fault_record(preset.name), watch(study, preset.name)
     over, under = panels(drawing, 2, 1, sharex=True)
     chart, C, t = found.charts["C"], record.columns["C"], record.time_min
@@ -197,19 +191,13 @@ def compare(study: Study, drawing: Drawing) -> Finding:
     legend_below(drawing, axes, 3)
     rows = []
     for preset, item in found:
-        report = (
-            ""
-            if not preset.settings["faults"]
-            else ("not seen" if item.first_min is None else f"{item.first_min - ONSET_MIN:.1f} min")
-        )
-        monitor = (
-            ""
-            if not preset.settings["faults"]
-            else ("not seen" if item.monitor_min is None else f"{item.monitor_min - ONSET_MIN:.1f} min")
-        )
-        missed = (
-            "" if not preset.settings["faults"] else f"{100 - item.out['C'][1]:.1f} / {100 - item.out['T'][1]:.1f} %"
-        )
+        report = monitor = missed = ""
+        if preset.settings["faults"]:
+            report, monitor = (
+                "not seen" if minute is None else f"{minute - ONSET_MIN:.1f} min"
+                for minute in (item.first_min, item.monitor_min)
+            )
+            missed = f"{100 - item.out['C'][1]:.1f} / {100 - item.out['T'][1]:.1f} %"
         rows.append(
             f"| `{preset.name}` | {report} | {missed} | {item.false_points} | {monitor} | {item.monitor_false} | "
             f"{item.cause or 'none'} |"
@@ -229,7 +217,7 @@ def compare(study: Study, drawing: Drawing) -> Finding:
 
 def _monitor_alarms(record: Record) -> list[tuple[float, str]]:
     """Times of the monitor's alarms with the likeliest cause, in order."""
-    result = backtest.run([encode(item) for item in samples_of(record, _PLANT)], MonitorConfig(plant=_PLANT))
+    result = backtest.run(messages_of(record), MonitorConfig())
     alarms = []
     for alarm, _ in sorted(result.raised_alarms, key=lambda item: item[0].raised_ns):
         cause = f"{alarm.suspects[0].cause} ({100 * alarm.suspects[0].probability:.0f} %)" if alarm.suspects else ""

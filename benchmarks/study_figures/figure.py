@@ -1,15 +1,27 @@
-"""Figures of the study, and their findings."""
+"""Figures of the study, their findings, and the paper that they are drawn on: matplotlib without a screen.
 
-from __future__ import annotations
+The same drawing gives the same bytes: the style is set here in full, whatever the user's matplotlibrc says, the font
+is the one that matplotlib brings, and the file carries neither date nor version. Colours are those of Okabe & Ito
+(2008), Color Universal Design, which people with any kind of colour vision tell apart.
+"""
 
-from collections.abc import Callable
+import io
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import Enum
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import matplotlib
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure as Drawing
+from PIL import Image
+
+from reactorwatch.records.write import atomic_write
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure as Drawing
-
     from benchmarks.study_figures.study import Study
 
 
@@ -37,7 +49,7 @@ class Figure:
     key: str  # number of the report's caption, such as `8`; `section-` and a word for a section
     title: str  # subject of the figure
     claim: str  # statement of the report, in our words
-    draw: Callable[[Study, Drawing], Finding]  # function that puts it on an empty drawing and returns the finding
+    draw: Callable[["Study", Drawing], Finding]  # function that puts it on an empty drawing and returns the finding
     height_px: int = 500  # height of the picture, which is 900 px wide
 
     @property
@@ -56,3 +68,68 @@ class Figure:
 def verdict(agrees: bool) -> Verdict:
     """Verdict on a claim that is right or wrong as a whole."""
     return Verdict.AGREES if agrees else Verdict.DISAGREES
+
+
+BLACK, GREY = "#000000", "#8c8c8c"
+BLUE, ORANGE, GREEN, VERMILION = "#0072B2", "#E69F00", "#009E73", "#D55E00"
+SKY, PURPLE = "#56B4E9", "#CC79A7"
+BY_ORDER = {1: ORANGE, 2: BLUE, 3: VERMILION}
+
+DPI = 100
+WIDTH_PX = 900
+_PALETTE = 256  # colours in a file: a third of the bytes
+
+_STYLE: Any = {
+    "font.family": "DejaVu Sans",
+    "font.size": 9.5,
+    "axes.titlesize": 10,
+    "axes.titlelocation": "left",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "grid.color": "#e4e4e4",
+    "grid.linewidth": 0.7,
+    "axes.axisbelow": True,
+    "axes.formatter.useoffset": False,
+    "lines.linewidth": 1.5,
+    "legend.fontsize": 8.5,
+    "legend.frameon": True,
+    "legend.framealpha": 0.85,
+    "legend.edgecolor": "none",
+    "figure.facecolor": "white",
+}
+
+
+@contextmanager
+def paper(path: Path, height_px: int) -> Iterator[Drawing]:
+    """An empty drawing, which is written to `path` (PNG) when the block ends without an error."""
+    with matplotlib.rc_context():
+        matplotlib.rcdefaults()
+        matplotlib.rcParams.update(_STYLE)
+        drawing = Drawing(figsize=(WIDTH_PX / DPI, height_px / DPI), dpi=DPI, layout="constrained")
+        FigureCanvasAgg(drawing)
+        yield drawing
+        pixels = io.BytesIO()
+        drawing.savefig(pixels, format="png", dpi=DPI, metadata={"Software": None})
+    picture = Image.open(pixels).convert("RGB").quantize(_PALETTE, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
+    with atomic_write(path) as temporary:
+        picture.save(temporary, format="PNG", optimize=True)
+
+
+def panels(drawing: Drawing, rows: int, columns: int, **options: Any) -> list[Axes]:
+    """Axes in a grid, row by row."""
+    return list(drawing.subplots(rows, columns, squeeze=False, **options).ravel())
+
+
+def label(axes: Axes, x: str, y: str, title: str = "") -> None:
+    """Name what is on the axes; an empty name is left out."""
+    axes.set_xlabel(x)
+    axes.set_ylabel(y)
+    if title:
+        axes.set_title(title)
+
+
+def legend_below(drawing: Drawing, axes: Axes, columns: int, extra: Sequence[Any] = ()) -> None:
+    """One legend for the whole drawing, under it."""
+    handles, _ = axes.get_legend_handles_labels()
+    drawing.legend(handles=[*handles, *extra], loc="outside lower center", ncols=columns)

@@ -5,28 +5,33 @@ folder. A fault is added to a measured record in a stated way: from `ONSET` of i
 by `BIAS` of the range that it has in the training, or by as much growing from zero to the end.
 """
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure as Drawing
 
 import reactorwatch as rw
-from benchmarks.study_figures.canvas import BLACK, BLUE, ORANGE, VERMILION, label, legend_below, panels
-from benchmarks.study_figures.figure import Figure, Finding, Verdict
+from benchmarks.study_figures.figure import (
+    BLACK,
+    BLUE,
+    ORANGE,
+    VERMILION,
+    Figure,
+    Finding,
+    Verdict,
+    label,
+    legend_below,
+    panels,
+)
 from benchmarks.study_figures.report_scheme import chart_output
 from benchmarks.study_figures.study import Study
 from reactorwatch.arrays import Array
 from reactorwatch.description.find import find_process
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure as Drawing
 
 ONSET, BIAS = 0.6, 0.1
 TITLE = "Measured records with added faults"

@@ -15,8 +15,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from sklearn.exceptions import ConvergenceWarning  # type: ignore[import-untyped]
+from sklearn.neural_network import MLPRegressor  # type: ignore[import-untyped]
 
-from reactorwatch.errors import InputError
 from reactorwatch.identification.data import ScaledRecord, plan_run, rows_of
 from reactorwatch.identification.linear import fit_linear
 from reactorwatch.identification.linear_model import LinearModel, fit_percent
@@ -95,11 +96,6 @@ class Neural:
         self, structure: Structure, inputs: ArrayLike, outputs: ArrayLike, time: ArrayLike | None = None
     ) -> NeuralModel:
         """Fit the networks and choose the one with the best simulation."""
-        try:
-            from sklearn.exceptions import ConvergenceWarning  # type: ignore[import-untyped]
-            from sklearn.neural_network import MLPRegressor  # type: ignore[import-untyped]
-        except ImportError as missing:
-            raise InputError("the neural model needs scikit-learn: pip install scikit-learn") from missing
         linear = fit_linear("arx", structure, inputs, outputs, time)
         record = ScaledRecord.of(structure, inputs, outputs, time)
         # Without the constant: the network has its own.

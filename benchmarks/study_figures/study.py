@@ -4,7 +4,7 @@ All records are simulated by this software, each with the seed of the study; wha
 """
 
 from collections.abc import Callable
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any
 
 import msgspec
@@ -43,13 +43,8 @@ FAST_PERIOD_MIN = 0.01
 class Study:
     """Model, records and fits of one run of `reproduce`."""
 
-    def __init__(self, seed: int, measured: Record | None = None) -> None:
+    def __init__(self, seed: int) -> None:
         self.seed = seed
-        self.measured = measured
-        self._points: dict[float, list[SteadyState]] = {}
-        self._fits: dict[tuple[str, int, str], Model] = {}
-        self._report_fits: dict[tuple[str, int, str], LinearModel] = {}
-        self._fault_records: dict[str, Record] = {}
 
     @cached_property
     def model(self) -> ProcessModel:
@@ -61,11 +56,10 @@ class Study:
         """Simulator of the reactor."""
         return Simulator(self.model)
 
+    @cache  # noqa: B019 # a study lives as long as its process
     def points(self, qc: float) -> list[SteadyState]:
         """The steady states at a coolant flow in l/min, from the coldest to the hottest."""
-        if qc not in self._points:
-            self._points[qc] = steady_states(self.model, np.array([qc]))
-        return self._points[qc]
+        return steady_states(self.model, np.array([qc]))
 
     def operating(self, qc: float = OPERATING_COOLANT_FLOW) -> SteadyState:
         """The steady state on the operating branch."""
@@ -74,7 +68,7 @@ class Study:
     @cached_property
     def identification(self) -> Record:
         """Record for identification: with the sensors' noise, 0.1 min between rows."""
-        return self.measured or simulate_record(PlantConfig(seed=self.seed, scenario=_IDENTIFICATION), _ROWS)
+        return simulate_record(PlantConfig(seed=self.seed, scenario=_IDENTIFICATION), _ROWS)
 
     @cached_property
     def noise_free(self) -> Record:
@@ -100,8 +94,6 @@ class Study:
         """Description of the identification record of figures 5, 6 and 11 to 16."""
         record = self.identification
         period = float(np.median(np.diff(record.time_min)))
-        if self.measured is not None:
-            return f"the record {record.name}, {record.rows} rows {period:g} min apart"
         low, high, noise = _IDENTIFICATION["low"], _IDENTIFICATION["high"], NOISE_SD
         return (
             f"{record.rows} simulated rows {period:g} min apart, a new coolant flow between {low:g} and {high:g} "
@@ -114,36 +106,28 @@ class Study:
         record = self.identification
         return record.columns["qc"], record.columns[output], record.time_min
 
+    @cache  # noqa: B019 # as `points`
     def fit(self, family: str, order: int, output: str) -> Model:
         """Fit a model to the first half of the identification record."""
-        key = (family, order, output)
-        if key not in self._fits:
-            u, y, t = self.signals(output)
-            half = y.size // 2
-            self._fits[key] = LINEAR_FITS[family](Structure.of_order(order), u[:half], y[:half], t[:half])
-        return self._fits[key]
+        half = (values[: values.size // 2] for values in self.signals(output))
+        return LINEAR_FITS[family](Structure.of_order(order), *half)
 
+    @cache  # noqa: B019 # as `points`
     def report_fit(self, family: str, order: int, output: str) -> LinearModel:
         """Fit a model to the first half of the identification record by the report's scheme; `arx` or `oe`."""
-        key = (family, order, output)
-        if key not in self._report_fits:
-            u, y, t = self.signals(output)
-            half = y.size // 2
-            fit = report_scheme.MODELS[family]
-            self._report_fits[key] = fit(Structure.of_order(order), u[:half], y[:half], t[:half])
-        return self._report_fits[key]
+        half = (values[: values.size // 2] for values in self.signals(output))
+        return report_scheme.MODELS[family](Structure.of_order(order), *half)
 
     def spread(self, signal: str) -> float:
         """Standard deviation of a signal over the first half of the identification record, in its unit."""
         values = self.identification.columns[signal]
         return float(np.nanstd(values[: values.size // 2]))
 
+    @cache  # noqa: B019 # as `points`
     def fault_record(self, preset: str) -> Record:
         """One of the four named records."""
-        if preset not in self._fault_records:
-            (settings,) = (item.settings for item in OPERATION.presets if item.name == preset)
-            self._fault_records[preset] = simulate_record(msgspec.convert({"seed": self.seed, **settings}, PlantConfig))
-        return self._fault_records[preset]
+        (settings,) = (item.settings for item in OPERATION.presets if item.name == preset)
+        return simulate_record(msgspec.convert({"seed": self.seed, **settings}, PlantConfig))
 
 
 def row_times(rows: int, period_min: float) -> Array:

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 from google.protobuf.message import Message
 
-from benchmarks.link_cuts import Router, connect_client
+from benchmarks.harness.site import Router, connect_client
 from monitor_node.config import MonitorConfig
 from monitor_node.replay import backtest
 from plant_node.config import PlantConfig

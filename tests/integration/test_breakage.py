@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks.fuzz import Mutator
-from benchmarks.link_cuts import connect_client
+from benchmarks.harness.site import connect_client
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication, decode, encode, encoding_of
 from reactorwatch.contract.messages_pb2 import QUALITY_GOOD, Sample

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from benchmarks.link_cuts import Proxy
+from benchmarks.harness.site import Proxy
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, decode, encode_message
 from reactorwatch.contract.messages_pb2 import AlarmCommand, CommandReply

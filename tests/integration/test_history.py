@@ -8,8 +8,7 @@ from queue import SimpleQueue
 import pytest
 import zenoh
 
-from benchmarks.link_cuts import Router, connect_client
-from benchmarks.recorder_kills import PATIENCE_S
+from benchmarks.harness.site import PATIENCE_S, Router, connect_client
 from reactorwatch.contract.codec import Encoded
 from reactorwatch.runtime.bus_zenoh import bus as bus_module
 from reactorwatch.runtime.config import BusConfig

@@ -11,20 +11,20 @@ from queue import Empty, SimpleQueue
 
 import pytest
 
-from benchmarks.link_cuts import (
+from benchmarks.harness.site import (
+    BATCHES_PER_S,
+    PATIENCE_S,
+    SIGNALS,
     Heard,
     Manner,
     Proxy,
+    Publisher,
     Router,
-    Whose,
+    Tokens,
     connect_client,
-    cut,
-    kill_router,
-    read_content,
     recorder_process,
-    stick,
 )
-from benchmarks.recorder_kills import BATCHES_PER_S, PATIENCE_S, SIGNALS, Publisher, Tokens
+from benchmarks.link_cuts import Whose, cut, kill_router, read_content, stick
 from reactorwatch.cli.info import info_text
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, decode

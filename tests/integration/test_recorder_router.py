@@ -11,7 +11,7 @@ from queue import SimpleQueue
 
 import pytest
 
-from benchmarks.link_cuts import Heard
+from benchmarks.harness.site import Heard
 from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Encoded, Publication, decode, encode

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.link_cuts import Heard, Proxy, Router, connect_client
+from benchmarks.harness.site import Heard, Proxy, Router, connect_client
 from monitor_node.alarms.commands import COMMANDS
 from monitor_node.config import MonitorConfig
 from monitor_node.node import MonitorNode

@@ -1,12 +1,9 @@
 """The neural predictor, in the same table."""
 
-import sys
-
 import numpy as np
 import pytest
 
 from benchmarks.study_figures.neural import Neural
-from reactorwatch.errors import InputError
 from reactorwatch.identification.linear_model import fit_percent
 from reactorwatch.identification.selection import LINEAR_FITS, select
 from reactorwatch.identification.structure import Structure
@@ -25,7 +22,6 @@ def bent_plant(rows: int = 1500) -> tuple[Array, Array]:
 
 
 def test_a_bent_plant_is_followed_where_no_linear_model_can() -> None:
-    pytest.importorskip("sklearn", reason="scikit-learn is not installed")
     selection = select(*bent_plant(), fits={**LINEAR_FITS, "neural": SMALL.fit}, orders=(1,))
     linear = max(c.free_run_percent for c in selection.candidates if c.family != "neural")
     assert selection.chosen.family == "neural"
@@ -35,7 +31,6 @@ def test_a_bent_plant_is_followed_where_no_linear_model_can() -> None:
 
 def test_a_linear_plant_stays_linear() -> None:
     """The network has nothing to add: its one-step fit is that of the ARX model it corrects, within a percent."""
-    pytest.importorskip("sklearn", reason="scikit-learn is not installed")
     noisy_plant = oscillating_plant()
     u, y = noisy_plant.inputs, noisy_plant.clean + 0.05 * np.random.default_rng(2).standard_normal(4000)
     model = SMALL.fit(Structure.of_order(2), u[:2000], y[:2000])
@@ -44,7 +39,6 @@ def test_a_linear_plant_stays_linear() -> None:
 
 
 def test_the_same_seed_gives_the_same_network_and_its_run_is_its_recursion() -> None:
-    pytest.importorskip("sklearn", reason="scikit-learn is not installed")
     u, y = bent_plant(300)
     model, again = SMALL.fit(Structure.of_order(2), u, y), SMALL.fit(Structure.of_order(2), u, y)
     np.testing.assert_array_equal(model.hidden, again.hidden)
@@ -54,9 +48,3 @@ def test_the_same_seed_gives_the_same_network_and_its_run_is_its_recursion() -> 
         own[k] = model.predict(u[: k + 1], own[: k + 1])[k, 0]
     np.testing.assert_allclose(model.simulate(u, y)[2:20, 0], own[2:20], rtol=1e-12)
     assert np.all(np.isnan(model.simulate(u, y)[:2]))
-
-
-def test_without_scikit_learn_the_cure_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "sklearn.exceptions", None)
-    with pytest.raises(InputError, match=r"the neural model needs scikit-learn: pip install scikit-learn"):
-        SMALL.fit(Structure.of_order(1), *bent_plant(300))

@@ -10,8 +10,7 @@ from scipy import linalg, stats
 from sklearn.covariance import EmpiricalCovariance  # type: ignore[import-untyped]
 
 from benchmarks.outside.peers import LAGS, WINDOW, CanonicalVariates, DynamicPca, Pca, cross_validated_limits, stack
-from benchmarks.outside.scores import blocks_of, bootstrap_interval, compare_rows, score_change_points
-from benchmarks.outside.table import Row, markdown
+from benchmarks.outside.scores import Row, blocks_of, bootstrap_interval, compare_rows, markdown, score_change_points
 
 Array = NDArray[np.float64]
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from benchmarks.soak.memory import GROWTH_MB, Taken, find_growth_mb, most_in_thirds
+from benchmarks.soak.findings import GROWTH_MB, Taken, find_growth_mb, most_in_thirds
 from benchmarks.soak.plan import draw_plan
 
 ROWS = 300

@@ -1,7 +1,6 @@
 """The study draws every figure of the report, prints its results with known numbers, and is reproducible."""
 
 import re
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -11,22 +10,18 @@ from PIL import Image
 from scipy.integrate import solve_ivp
 from scipy.optimize import fsolve
 
-from benchmarks.study_figures import canvas
-from benchmarks.study_figures.__main__ import main
-from benchmarks.study_figures.best_model import ThirdOrder
+from benchmarks.study_figures import figure as canvas
+from benchmarks.study_figures.__main__ import reproduce
 from benchmarks.study_figures.catalogue import FIGURES
-from benchmarks.study_figures.figure import Figure, Finding, Verdict
+from benchmarks.study_figures.figure import Finding, Verdict
 from benchmarks.study_figures.measured_records import FAULTS, TITLE, measured_figure
-from benchmarks.study_figures.reproduce import reproduce
-from benchmarks.study_figures.sampling_rate import report_choice
-from benchmarks.study_figures.study import Study, row_times
-from reactorwatch.errors import InputError
+from benchmarks.study_figures.models import ThirdOrder
+from benchmarks.study_figures.sampling import report_choice
+from benchmarks.study_figures.study import Study
 from reactorwatch.identification.selection import Candidate, Selection
-from reactorwatch.records.record import Record
 
 DOCS = Path(__file__).parents[3] / "docs"
 CHEAP = ("3", "9", "21-27", "section-excitation")
-ROWS = 800
 
 
 @pytest.fixture(scope="module")
@@ -55,13 +50,6 @@ def of_figure(page: str, key: str) -> str:
     return page.partition(f"## {figure.heading}\n")[2].partition("\n## ")[0]
 
 
-def test_each_figure_of_the_report_is_in_the_catalogue_once() -> None:
-    keys = [figure.key for figure in FIGURES]
-    assert keys[:19] == [*map(str, range(3, 21)), "21-27"]
-    assert len(set(keys)) == len(keys)
-    assert all(figure.claim and figure.title for figure in FIGURES)
-
-
 def test_the_page_in_the_docs_has_every_entry_once_and_no_other() -> None:
     kept = (DOCS / "study.md").read_text(encoding="utf-8")
     headings = re.findall(r"^## (.*)$", kept, re.MULTILINE)
@@ -84,12 +72,6 @@ def test_a_fault_is_added_to_a_measured_record_and_both_watch_it(
     rows = re.findall(r"^\| (.*?) \| (none|step|drift) \|", finding.text, re.MULTILINE)
     assert rows == [("DaISy reactor", "step")]
     assert "concentration_bias" in finding.text
-
-
-def test_a_folder_without_the_records_names_them(tmp_path: Path) -> None:
-    with canvas.paper(tmp_path / "measured.png", 400) as drawing:
-        finding = measured_figure(tmp_path).draw(Study(1), drawing)
-    assert finding.text.startswith("None of the records is in the folder: daisy_cstr.csv")
 
 
 def test_a_run_writes_a_page_and_pictures_that_hold_what_is_plotted(tmp_path: Path) -> None:
@@ -243,85 +225,3 @@ def test_the_report_s_rows_never_see_a_square_wave_move_between_two_lags(
     assert said.startswith("refused") is blind
     assert (chosen > 1e13) is blind
     assert every_row < 1e4
-
-
-def test_a_measured_record_is_learned_from_where_one_is_given(tmp_path: Path) -> None:
-    rng = np.random.default_rng(1)
-    u = np.repeat(rng.uniform(90, 110, ROWS // 10), 10)
-    T = 438 - 0.8 * np.convolve(u - 100, 0.8 ** np.arange(40) / 5)[:ROWS] + rng.normal(0, 0.1, ROWS)
-    record = Record(row_times(ROWS, 0.1), {"qc": u, "T": T, "C": 0.1 - (T - 438) / 500}, "plant-7.csv")
-    reproduce(tmp_path, 1, "11", record)
-    page = (tmp_path / "study.md").read_text()
-    assert f"the record plant-7.csv, {ROWS} rows 0.1 min apart" in page
-    assert "Figures 5, 6 and 11 to 16" not in page
-
-
-@pytest.mark.parametrize("only", ["2", "28", "seven", "", "4,", "7.0", "section-"])
-def test_figures_that_there_are_not_are_named(tmp_path: Path, only: str) -> None:
-    with pytest.raises(InputError, match=r"--only: unknown figure '.*\(valid: 3, 4, 5, 6, 7, "):
-        reproduce(tmp_path / "out", 1, only)
-    assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.parametrize("name", ["out", "out/study"])
-def test_an_output_folder_that_is_a_file_is_refused(tmp_path: Path, name: str) -> None:
-    file = tmp_path / name
-    file.parent.mkdir(exist_ok=True)
-    file.write_text("not a folder")
-    with pytest.raises(InputError, match="is a file, the name of a folder was expected"):
-        reproduce(tmp_path / "out", 1, "8")
-
-
-def test_without_matplotlib_the_cure_is_one_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Through the program's own entry: one line on standard error and exit code 2, nothing written."""
-    monkeypatch.setitem(sys.modules, "matplotlib", None)
-    assert main(["--out", str(tmp_path / "out")]) == 2
-    said = capsys.readouterr()
-    assert said.err == "reproduce: pictures need matplotlib: pip install 'reactorwatch[pictures]'\n"
-    assert said.out == ""
-    assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.parametrize(
-    "options", [["--only", "99"], ["--seed", "-1"], ["--record", "missing.csv"], ["--data", "missing"]]
-)
-def test_bad_options_end_with_code_2_and_one_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str]
-) -> None:
-    assert main(["--out", str(tmp_path / "out"), *options]) == 2
-    assert capsys.readouterr().err.count("\n") == 1
-    assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.parametrize("name", ["study.md", "study/figure-07.png"])
-def test_the_record_that_is_read_is_never_replaced(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
-) -> None:
-    record = tmp_path / name
-    record.parent.mkdir(exist_ok=True)
-    record.write_text("time_min,qc,C,T\n0,103,0.1,440\n1,103,0.1,440\n")
-    before = record.read_bytes()
-    assert main(["--out", str(tmp_path), "--only", "7", "--record", str(record), "--force"]) == 2
-    assert capsys.readouterr().err.count("\n") == 1
-    assert [path for path in tmp_path.rglob("*") if path.is_file()] == [record]
-    assert record.read_bytes() == before
-
-
-def test_the_program_writes_the_figure_that_is_asked_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["--out", str(tmp_path), "--only", "9", "--jobs", "1"]) == 0
-    assert f"wrote {tmp_path / 'study.md'} and 1 pictures" in capsys.readouterr().out
-    assert [path.name for path in (tmp_path / "study").iterdir()] == ["figure-09.png"]
-
-
-def test_a_figure_that_fails_leaves_no_page_and_no_picture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from benchmarks.study_figures import reproduce as module
-
-    def fails(_study: Study, _drawing: object) -> Finding:
-        raise InputError("a record that cannot be used")
-
-    monkeypatch.setattr(module, "FIGURES", (Figure("4", "title", "claim", fails),))
-    with pytest.raises(InputError, match="cannot be used"):
-        reproduce(tmp_path, 1)
-    assert [path for path in tmp_path.rglob("*") if path.is_file()] == []

@@ -1,16 +1,28 @@
-"""Section 3.5.2: how the regressors and the response look at different sampling periods."""
-
-from __future__ import annotations
+"""Section 3.5 and the sampling rate: inputs that excite a model enough, and periods that are good."""
 
 from itertools import combinations
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure as Drawing
 
-from benchmarks.study_figures.canvas import BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, VERMILION, label, panels
-from benchmarks.study_figures.figure import Finding, Verdict
+from benchmarks.study_figures.figure import (
+    BLACK,
+    BLUE,
+    GREEN,
+    GREY,
+    ORANGE,
+    PURPLE,
+    VERMILION,
+    Finding,
+    Verdict,
+    label,
+    panels,
+    verdict,
+)
 from benchmarks.study_figures.report_scheme import EVERY, SKIP, report_rows
-from benchmarks.study_figures.study import FAST_PERIOD_MIN, IDENTIFICATION_HOLD_MIN, Study
+from benchmarks.study_figures.study import FAST_PERIOD_MIN, IDENTIFICATION_HOLD_MIN, ORDERS, Study, levels, row_times
+from plant_node.scenario import RandomSteps, Scenario, Sines, Square
 from reactorwatch.arrays import Array
 from reactorwatch.errors import InputError
 from reactorwatch.identification.checks import (
@@ -18,6 +30,7 @@ from reactorwatch.identification.checks import (
     LARGEST_CONDITION,
     SLOWEST_SAMPLES,
     conditioning,
+    persistence,
     sampling,
 )
 from reactorwatch.identification.data import Rows, ScaledRecord
@@ -25,8 +38,49 @@ from reactorwatch.identification.least_squares import SINGULAR_CONDITION, least_
 from reactorwatch.identification.structure import Structure
 from reactorwatch.records.record import Record
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure as Drawing
+_INPUTS: tuple[tuple[str, Scenario], ...] = (
+    ("single sinusoid", Sines(100.0, (6.0,), (5.0,))),
+    ("sum of three sinusoids", Sines(100.0, (4.0, 3.0, 2.0), (3.1, 7.3, 19.7))),
+    ("square wave", Square(95.0, 105.0, 20.0)),
+    ("random steps", RandomSteps(90.0, 111.0, 1.0)),
+)
+_ROWS, _PERIOD_MIN, _SHOWN_MIN = 4000, 0.1, 40.0
+
+
+def excitation(study: Study, drawing: Drawing) -> Finding:
+    """Each input, its spectrum, and what the check says of it."""
+    time_min = row_times(_ROWS, _PERIOD_MIN)
+    frequency = np.fft.rfftfreq(_ROWS, _PERIOD_MIN)
+    needed = 2 * max(ORDERS)
+    axes = panels(drawing, len(_INPUTS), 2, sharex="col", gridspec_kw={"width_ratios": (1.0, 1.0)})
+    rows, accepted = [], {}
+    for (name, scenario), over_time, over_frequency in zip(_INPUTS, axes[::2], axes[1::2], strict=True):
+        u = levels(scenario, time_min, study.seed)
+        checks = {order: persistence(u, 2 * order) for order in ORDERS}
+        accepted[name] = checks[max(ORDERS)].passed
+        colour = GREEN if accepted[name] else VERMILION
+        shown = time_min <= _SHOWN_MIN
+        over_time.step(time_min[shown], u[shown], where="post", color=BLUE, linewidth=1.2)
+        spectrum = 2 * np.abs(np.fft.rfft(u - u.mean())) / _ROWS
+        over_frequency.semilogy(frequency[1:], np.maximum(spectrum[1:], 1e-4), color=colour, linewidth=1)
+        over_frequency.set_ylim(1e-4, 20)
+        over_frequency.set_xlim(0, 1.0)
+        said = "accepted" if accepted[name] else "refused"
+        label(over_time, "", "l/min", name)
+        label(over_frequency, "", "l/min", f"excites order {checks[max(ORDERS)].value:.0f} of {needed}: {said}")
+        verdicts = " | ".join("accepted" if checks[order].passed else "refused" for order in ORDERS)
+        rows.append(f"| {name} | {verdicts} |")
+    axes[-2].set_xlabel("time, min")
+    axes[-1].set_xlabel("frequency, 1/min (amplitude spectrum)")
+    reason = persistence(levels(_INPUTS[0][1], time_min, study.seed), needed).result
+    text = (
+        "An ARX or OE model of order n has 2 n parameters on past outputs and inputs, and needs an input that excites "
+        "as many.\n\n| input | order 1 | order 2 | order 3 |\n|---|---|---|---|\n" + "\n".join(rows) + "\n\n"
+        f'What the software says of the single sinusoid for a third-order model: "{reason}".'
+    )
+    as_reported = not accepted["single sinusoid"] and accepted["sum of three sinusoids"] and accepted["square wave"]
+    return Finding(text, verdict(as_reported))
+
 
 _DECIMATIONS = (1, 2, 4, 5, 10, 20, 30, 40, 60, 80, 120, 240)
 """Every level of the fast records is held for a whole number of such periods."""
@@ -43,7 +97,7 @@ _TOP = 1e7  # of the picture; what is above is drawn at its edge
 _STRUCTURE = Structure.of_order(3)
 
 
-def draw(study: Study, drawing: Drawing) -> Finding:
+def sampling_rate(study: Study, drawing: Drawing) -> Finding:
     """Condition number and length of the step response over the sampling period."""
     for_condition, for_response = panels(drawing, 1, 2)
     periods = np.array(_DECIMATIONS) * FAST_PERIOD_MIN
