@@ -46,14 +46,16 @@ class Persistence:
 
     parameter_count = 0
 
-    def predict(self, inputs: Array, outputs: Array, time: ArrayLike | None = None) -> Array:
-        return np.concatenate([np.full_like(outputs[:1], np.nan), outputs[:-1]])
+    def predict(self, inputs: ArrayLike, outputs: ArrayLike, time: ArrayLike | None = None) -> Array:
+        y = np.asarray(outputs, dtype=float)
+        return np.concatenate([np.full_like(y[:1], np.nan), y[:-1]])
 
-    def simulate(self, inputs: Array, outputs: Array, time: ArrayLike | None = None) -> Array:
-        return np.concatenate([np.full_like(outputs[:1], np.nan), np.repeat(outputs[:1], len(outputs) - 1, axis=0)])
+    def simulate(self, inputs: ArrayLike, outputs: ArrayLike, time: ArrayLike | None = None) -> Array:
+        y = np.asarray(outputs, dtype=float)
+        return np.concatenate([np.full_like(y[:1], np.nan), np.repeat(y[:1], len(y) - 1, axis=0)])
 
-    def residuals(self, inputs: Array, outputs: Array, time: ArrayLike | None = None) -> Array:
-        return outputs - self.predict(inputs, outputs, time)
+    def residuals(self, inputs: ArrayLike, outputs: ArrayLike, time: ArrayLike | None = None) -> Array:
+        return np.asarray(outputs, dtype=float) - self.predict(inputs, outputs, time)
 
 
 def test_another_family_joins_the_table_like_a_shipped_one(noisy_plant: NoisyPlant) -> None:
