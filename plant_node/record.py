@@ -9,8 +9,7 @@ from msgspec.structs import replace as with_changes
 from plant_node.config import PlantConfig, fit_settings
 from plant_node.core import Plant
 from plant_node.scenario import FromFile, HeldRecord, Scenario
-from reactorwatch.description.choice import ProcessChoice
-from reactorwatch.description.find import build_process, find_process
+from reactorwatch.description.find import ProcessChoice, build_process, find_process
 from reactorwatch.description.process import Process
 from reactorwatch.description.read import convert_to_process
 from reactorwatch.process.effect import TIMING

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from reactorwatch.contract.codec import Encoded, encode
 from reactorwatch.contract.keys import DEFAULT_PLANT, check_plant
-from reactorwatch.description.choice import DEFAULT_CHOICE, ProcessChoice
+from reactorwatch.description.find import DEFAULT_CHOICE, ProcessChoice
 from reactorwatch.errors import InputError
 from reactorwatch.records.decode import TABLE_SUFFIXES, is_table, list_files
 from reactorwatch.records.file_format import GUESS, FileFormat

@@ -11,8 +11,7 @@ from reactorwatch.cli.option_groups import BusOptions, ClientOptions, PlantOptio
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, decode, encode_message
 from reactorwatch.contract.messages_pb2 import CommandReply
-from reactorwatch.description.find import find_process
-from reactorwatch.description.plants import PlantProcesses
+from reactorwatch.description.find import PlantProcesses, find_process
 from reactorwatch.description.process import Process
 from reactorwatch.errors import InputError
 from reactorwatch.runtime.bus_zenoh import connect

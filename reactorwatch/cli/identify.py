@@ -5,8 +5,7 @@ from collections.abc import Sequence
 import msgspec
 
 from reactorwatch.cli.display import json_line
-from reactorwatch.description.choice import ProcessChoice
-from reactorwatch.description.find import DEFAULT_PROCESS, find_process
+from reactorwatch.description.find import DEFAULT_PROCESS, ProcessChoice, find_process
 from reactorwatch.description.process import Process
 from reactorwatch.errors import InputError, describe_unknown
 from reactorwatch.identification.data import Dataset

@@ -23,7 +23,7 @@ from reactorwatch.errors import InputError
 from reactorwatch.records.file_format import GUESS
 
 if TYPE_CHECKING:
-    from reactorwatch.description.choice import ProcessChoice
+    from reactorwatch.description.find import ProcessChoice
 
 
 def up(

@@ -10,8 +10,7 @@ from monitor_node.replay.verification import COMPARED, Verification, verify
 from reactorwatch.cli.display import json_line, print_lines, print_report, task
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded
-from reactorwatch.description.choice import ProcessChoice
-from reactorwatch.description.find import find_in_catalogue, find_process
+from reactorwatch.description.find import ProcessChoice, find_in_catalogue, find_process
 from reactorwatch.description.process import Process
 from reactorwatch.errors import InputError
 from reactorwatch.records.decode import is_table

@@ -1,17 +1,23 @@
-"""Find a process: by name in the catalogue, or in a file that describes it (`.toml`, `.py`, `extended.json`).
+"""Find a process: by name in the catalogue, in a file that describes it, or by the columns of its signals.
 
-Only a user chooses a file, by an option, a settings file or an argument (`find_process`). A name that data state, such
-as the settings in a recording, is looked up in the catalogue (`find_in_catalogue`) and never opened as a path.
+The catalogue holds the processes that are shipped, and installed ones (entry points). A file is a `.toml`, a `.py` or
+an `extended.json`. Only a user chooses a file, by an option, a settings file or an argument (`find_process`). A name
+that data state, such as the settings in a recording, is looked up in the catalogue (`find_in_catalogue`) and never
+opened as a path.
 """
 
 import runpy
-from dataclasses import replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from fnmatch import fnmatchcase
+from functools import partial
+from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 
-from reactorwatch.description.catalogue import catalogue, check_process
-from reactorwatch.description.process import Process, describe_model
+from reactorwatch.description.process import Process, Signal, describe_model
 from reactorwatch.description.toml_file import parse_process, parse_tables
 from reactorwatch.errors import InputError, describe_exception, describe_unknown, prefix_errors
+from reactorwatch.process import MODELS
 from reactorwatch.process.extended_model import ExtendedModel, parse_extended_model
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.decode import read_regular, wrap_read_errors
@@ -23,6 +29,42 @@ DEFAULT_PROCESS = "cstr"
 
 FILE_KINDS = (".toml", ".py", ".json")
 """Suffixes of files that describe a process."""
+
+GROUP = "reactorwatch.processes"
+"""Group of entry points by which other packages add processes: functions that return a `Process`."""
+
+ALIASES = {"cascaded_tanks": "tanks"}
+"""Other names of shipped processes."""
+
+
+def catalogue() -> dict[str, Callable[[], Process]]:
+    """Functions that return processes, by name; a shipped process goes before an installed one of its name."""
+    models = [make() for make in MODELS]
+    shipped: dict[str, Callable[[], Process]] = {model.name: partial(describe_model, model) for model in models}
+    shipped |= {alias: shipped[name] for alias, name in ALIASES.items()}
+    installed = {item.name: partial(_load, item) for item in entry_points(group=GROUP)}
+    return {**shipped, **{name: load for name, load in installed.items() if name not in shipped}}
+
+
+def _load(entry: EntryPoint) -> Process:
+    """Call the function of an entry point."""
+    name = f"process {entry.name!r} of {entry.value}"
+    try:
+        found = entry.load()()
+    except Exception as error:  # code of another package may raise anything
+        raise InputError(f"{name}: {describe_exception(error)}") from error
+    return check_process(found, name)
+
+
+def check_process(found: object, name: str) -> Process:
+    """Check that what a function of a user's code returned is a process; returns it.
+
+    Raises:
+        InputError: it is not.
+    """
+    if not isinstance(found, Process):
+        raise InputError(f"{name}: must return a reactorwatch Process, got {type(found).__name__}")
+    return found
 
 
 def find_process(
@@ -122,3 +164,90 @@ def _call_function(path: Path) -> object:
     except BaseException as error:  # the user's code may raise anything, and may call sys.exit
         raise InputError(describe_exception(error)) from error
     raise InputError(f"it must have a function {FUNCTION}() that returns a Process, got none")
+
+
+@dataclass(frozen=True)
+class ProcessChoice:
+    """Choice of a process.
+
+    Attributes:
+        process: a name in the catalogue or a path, see `find_process`; None: the reactor, unless columns are named.
+        inputs: columns that are inputs of a process without a description.
+        outputs: columns that are its outputs.
+        modes: columns that say how it is operated.
+
+    Raises:
+        InputError: a process and columns are named, or inputs or modes without an output.
+    """
+
+    process: str | None = None
+    inputs: tuple[str, ...] = ()
+    outputs: tuple[str, ...] = ()
+    modes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.process is not None and (self.inputs or self.outputs or self.modes):
+            raise InputError(
+                "--input, --output and --mode describe a process without a file, got them beside --process "
+                f"{self.process}; leave one of the two out"
+            )
+        for role, names in (("mode", self.modes), ("input", self.inputs)):
+            if names and not self.outputs:
+                raise InputError(f"--{role} needs an --output, got only the {role} {', '.join(names)}")
+
+    @property
+    def is_default(self) -> bool:
+        """True if neither a process nor columns are named."""
+        return self.process is None and not self.outputs
+
+    @property
+    def file(self) -> Path | None:
+        """File that describes the process; None: it is named otherwise."""
+        path = None if self.process is None else Path(self.process)
+        return path if path is not None and path.suffix.lower() in FILE_KINDS else None
+
+    def absolute(self) -> "ProcessChoice":
+        """Copy with the absolute path of the file."""
+        return self if self.file is None else replace(self, process=str(self.file.absolute()))
+
+    def load(self, zero_ns: int = 0, *, on_bus: bool = False) -> Process:
+        """Load the process.
+
+        Args:
+            zero_ns: time from which the minutes of an extended model count; 0: the one that its file states.
+            on_bus: see `find_process`.
+
+        Raises:
+            InputError: as `find_process`.
+        """
+        if self.outputs:
+            roles = {"input": self.inputs, "output": self.outputs, "mode": self.modes}
+            signals = (Signal(name, role=role) for role, names in roles.items() for name in names)
+            return Process("plant", tuple(signals))
+        return find_process(self.process or DEFAULT_PROCESS, zero_ns, on_bus=on_bus)
+
+
+DEFAULT_CHOICE = ProcessChoice()
+"""No process and no columns are named: the reactor."""
+
+
+class PlantProcesses:
+    """Processes by plant.
+
+    Args:
+        names: name or file of a process by plant, or by a pattern of plants such as `north_*`; a plant's own entry goes
+            before patterns, and the first pattern counts.
+
+    Raises:
+        InputError: a process cannot be loaded.
+    """
+
+    def __init__(self, names: Mapping[str, str]) -> None:
+        loaded = {name: ProcessChoice(name).load() for name in dict.fromkeys(names.values())}
+        self._processes = {plant: loaded[name] for plant, name in names.items()}
+
+    def find(self, plant: str) -> Process | None:
+        """Process of a plant; None: it is not stated."""
+        if plant in self._processes:
+            return self._processes[plant]
+        return next((item for pattern, item in self._processes.items() if fnmatchcase(plant, pattern)), None)

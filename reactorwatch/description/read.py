@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from reactorwatch.arrays import Array
-from reactorwatch.description.choice import ProcessChoice
-from reactorwatch.description.find import DEFAULT_PROCESS
+from reactorwatch.description.find import DEFAULT_PROCESS, ProcessChoice
 from reactorwatch.description.process import Process
 from reactorwatch.errors import InputError, describe_unknown
 from reactorwatch.records.file_format import GUESS, FileFormat

@@ -11,7 +11,7 @@ import numpy as np
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import encode
 from reactorwatch.contract.messages_pb2 import Sample
-from reactorwatch.description.choice import DEFAULT_CHOICE, ProcessChoice
+from reactorwatch.description.find import DEFAULT_CHOICE, ProcessChoice
 from reactorwatch.description.process import Process
 from reactorwatch.description.read import convert_to_process, read_signals
 from reactorwatch.errors import InputError

@@ -22,8 +22,7 @@ from reactorwatch.cli.my_plant import describe_in_file
 from reactorwatch.cli.option_groups import BusOptions
 from reactorwatch.cli.plant_settings import PlayedRecord, load_source
 from reactorwatch.cli.up import diagnosis_settings
-from reactorwatch.description.choice import ProcessChoice
-from reactorwatch.description.find import find_process
+from reactorwatch.description.find import ProcessChoice, find_process
 from reactorwatch.description.process import Process, Signal
 from reactorwatch.errors import InputError
 from reactorwatch.process import MODELS

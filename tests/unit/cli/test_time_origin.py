@@ -17,7 +17,7 @@ from reactorwatch.cli.backtest import BacktestOptions, run_job
 from reactorwatch.cli.batch import make_jobs
 from reactorwatch.cli.options import parse_span_ns
 from reactorwatch.cli.recordings import cut
-from reactorwatch.description.choice import ProcessChoice
+from reactorwatch.description.find import ProcessChoice
 from reactorwatch.diagnosis.diagnose import diagnose
 from reactorwatch.process.library.cstr import cstr
 from reactorwatch.records.record import Record

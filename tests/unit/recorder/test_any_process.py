@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from reactorwatch.cli.info import info_object, info_text
-from reactorwatch.description.choice import ProcessChoice
-from reactorwatch.description.find import find_process
+from reactorwatch.description.find import ProcessChoice, find_process
 from reactorwatch.description.process import ROLES, Process, Signal
 from reactorwatch.description.read import read_process_table
 from reactorwatch.errors import InputError

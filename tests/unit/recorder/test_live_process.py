@@ -10,8 +10,7 @@ from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from reactorwatch.cli.diagnose import DiagnosisOptions, load_case
 from reactorwatch.contract.codec import encode
-from reactorwatch.description.find import find_process
-from reactorwatch.description.plants import PlantProcesses
+from reactorwatch.description.find import PlantProcesses, find_process
 from reactorwatch.description.process import Process
 from reactorwatch.errors import InputError
 from reactorwatch.process import MODELS
