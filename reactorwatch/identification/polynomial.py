@@ -65,6 +65,11 @@ class PolynomialModel:
     rows: int
     simulates: bool = False
 
+    @property
+    def parameter_count(self) -> int:
+        """Number of coefficients."""
+        return self.values.size
+
     def predict(self, inputs: ArrayLike, outputs: ArrayLike, time: ArrayLike | None = None) -> Array:
         """See `LinearModel.predict`."""
         u, y = self._scale(inputs, outputs)

@@ -281,11 +281,14 @@ class RecursiveLeastSquares:
         if row.ndim != 1 or row.size != self._parameters:
             raise ValueError(f"regressor must have shape ({self._parameters},), got {row.shape}")
         result = update_row(
-            self._numbers, self._work, row, float(output), self.forgetting, self._renewal, self._rank_share
+            self._numbers, self._work, row, float(output), self._forgetting, self._renewal, self._rank_share
         )
         if result[0] != result[0]:
             values = {**{f"regressor[{i}]": value for i, value in enumerate(row)}, "output": output}
-            name, value = next((name, value) for name, value in values.items() if not abs(value) < LARGEST_VALUE)
+            name, value = next(
+                ((name, value) for name, value in values.items() if not abs(value) < LARGEST_VALUE),
+                ("the prediction", result[0]),  # of a damaged memory
+            )
             raise ValueError(f"{name} must be a finite number below {LARGEST_VALUE:g} in size, got {value}")
         return RlsUpdate(*result)
 
@@ -373,6 +376,11 @@ class RecursiveLeastSquares:
         return np.where(known, covariance, math.nan) * (variance if math.isfinite(variance) else 1.0)
 
     @property
+    def forgetting(self) -> float:
+        """Weight of a row relative to its successor."""
+        return self._forgetting
+
+    @property
     def condition(self) -> float:
         """Condition number of the regressors in memory; inf if they don't determine the parameters."""
         values = np.linalg.svd(np.sqrt(self._diagonal)[:, None] * self._factor(), compute_uv=False)
@@ -386,7 +394,7 @@ class RecursiveLeastSquares:
                 f"covariance_limit must be below {LARGEST_VALUE} when forgetting < 1, got {self._covariance_limit}"
             )
         n, f = self._parameters, float(forgetting)
-        self.forgetting = self.memory.forgetting = f
+        self._forgetting = self.memory.forgetting = f
         self._renewal = (1.0 - f**n) / (self._covariance_limit * f ** (n - 1))
 
     def _factor(self) -> NDArray[np.float64]:

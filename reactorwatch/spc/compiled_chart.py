@@ -121,7 +121,13 @@ class Bank:
 
     @classmethod
     def of(cls, charts: Sequence[CompiledChart]) -> "Bank":
-        """Charts that go on from those of one kind."""
+        """Charts that go on from those of one kind.
+
+        Raises:
+            ValueError: they are of several kinds.
+        """
+        if len(kinds := {type(chart) for chart in charts}) != 1:
+            raise ValueError(f"charts must be one or more of one kind, got {sorted(kind.__name__ for kind in kinds)}")
         numbers = np.concatenate([chart.memory.numbers for chart in charts], axis=1)
         return cls(type(charts[0]), SignalMemory(charts[0].name, numbers))
 

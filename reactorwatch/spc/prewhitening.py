@@ -255,7 +255,7 @@ def innovations(numbers: NDArray[np.void], z: Sequence[float]) -> list[float]:
         numbers: numbers of the filters, shape (filters,).
         z: the next value of each; NaN if it is missing.
     """
-    values = np.array(z)
+    values = np.array(z, dtype=np.float64)
     _INNOVATIONS.call(numbers, values)
     e: list[float] = values.tolist()
     return e

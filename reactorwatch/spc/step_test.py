@@ -196,7 +196,7 @@ class StepTests:
         Args:
             z: residual of each signal; NaN where there is none.
         """
-        return bool(_UPDATE.call(self.numbers, np.array(z), self._statistics))
+        return bool(_UPDATE.call(self.numbers, np.array(z, dtype=np.float64), self._statistics))
 
     def sensitivity(self, signal: int) -> float:
         """Statistic after a lasting step of one unit of a signal, without noise: what no outlier explains of it."""

@@ -124,6 +124,9 @@ class ParameterT2(Chart):
         inputs: shape (q, p): makes the inputs in a regressor, and the 1 of an offset, white as in the training; without
             it nothing is known of their excitation, and it is taken to be as in the training.
         forgetting: forgetting factor of the adaptive model.
+
+    Raises:
+        InputError: an argument out of its range, or of a shape that does not fit the names.
     """
 
     name = "parameters"
@@ -138,13 +141,24 @@ class ParameterT2(Chart):
         forgetting: float = 0.999,
     ) -> None:
         made = np.array(root, dtype=np.float64, order="C")
-        white = np.zeros((0, len(names))) if inputs is None else np.array(inputs, dtype=np.float64, order="C")
+        white = np.array([] if inputs is None else inputs, dtype=np.float64, order="C")
+        white = white if white.size else white.reshape(0, len(names))
         self._use(ParameterMemory(tuple(names), made, limit, white, float(forgetting), np.eye(len(white))))
 
     def _use(self, memory: ParameterMemory) -> None:
         """See `Chart`."""
         self.memory, self.names = memory, memory.names
         self.limit = positive("limit", memory.limit)
+        if not 0.0 < memory.forgetting < 1.0:
+            raise InputError(f"forgetting must be in (0, 1), got {memory.forgetting}")
+        for name, rows in (("root", memory.root), ("inputs", memory.inputs)):  # the kernel checks no bounds
+            if rows.ndim != 2 or rows.shape[1] != len(memory.names) or not np.all(np.isfinite(rows)):
+                columns = len(memory.names)
+                raise InputError(
+                    f"{name} must be rows of {columns} finite numbers, one a parameter, got {rows.tolist()}"
+                )
+        if not len(memory.root):
+            raise InputError("root must have a row for each direction that is charted, got none")
         q, excitation = len(memory.inputs), memory.excitation
         if excitation.shape != (q, q) or not np.all(np.isfinite(excitation)):
             raise ValueError(f"excitation must be {q} rows of finite numbers, got {excitation.tolist()}")
@@ -261,7 +275,7 @@ def learn(
     """Design the chart of a model from a training record.
 
     Args:
-        regressors: shape (rows, p), by time, in scaled units (outputs of the order of 1); one column is not 0.
+        regressors: shape (rows, p), by time, in scaled units: outputs of the order of 1.
         residuals: residuals of any model with these regressors, in scaled units, shape (rows,); the part that the
             regressors still explain is removed.
         forgetting: forgetting factor f of the adaptive model, and of the reference in training, in [0.9, 0.9999].
@@ -271,13 +285,24 @@ def learn(
         past_outputs: number of leading regressors that are past outputs; the others are inputs and offset.
 
     Raises:
-        InputError: an argument out of its range, or a training too short, or with all excitation of a parameter in a
-            few rows.
+        InputError: an argument out of its range or of a wrong shape, a value that is not finite, or a training too
+            short, without any excitation, or with all excitation of a parameter in a few rows.
     """
     phi, e = np.asarray(regressors, dtype=np.float64), np.asarray(residuals, dtype=np.float64)
+    if phi.ndim != 2 or phi.shape[1] != len(names) or e.shape != phi.shape[:1]:
+        raise InputError(
+            f"regressors must have {len(names)} columns and as many rows as there are residuals, "
+            f"got {phi.shape} and {e.shape}"
+        )
+    if not (np.all(np.isfinite(phi)) and np.all(np.isfinite(e))):
+        raise InputError("regressors and residuals must be finite numbers; leave out the rows that are not")
+    check_range("past_outputs", past_outputs, 0, len(names))
+    check_range("reference_rows", reference_rows, 1, float("inf"))
     rows = len(phi)
     white = _whitening(phi)
     m, vectors = len(white), floor(0.4 * rows ** (2.0 / 3.0))
+    if m == 0:
+        raise InputError("regressors must vary or have an offset, all of them are 0")
     if vectors < 2 * m:  # fewer determine no covariance of m directions
         least = (2 * m / 0.4) ** 1.5
         raise InputError(f"training must have at least {least:.0f} rows for {m} parameters, got {rows}")

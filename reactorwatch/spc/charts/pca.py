@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from reactorwatch.arrays import Array
+from reactorwatch.errors import InputError
 from reactorwatch.spc.charts.base import Baseline, JointChart, Judgement, vector
 from reactorwatch.spc.charts.t2 import T2
 from reactorwatch.spc.false_alarm_budget import TrainingErrors
@@ -57,17 +58,31 @@ class PcaModel(Memory):
         """The model of a training matrix.
 
         Args:
-            training: shape (n, p), rows of a time when all was well, of signals none of which follows from others.
+            training: shape (n, p), rows of a time when all was well.
             components: a, how many the signals have in common, in [1, p - 1].
             false_alarm: alpha, the probability of a false alarm per sample, of each of the two charts.
+
+        Raises:
+            InputError: an argument out of its range, or a signal that does not vary.
         """
         from scipy import stats
 
         matrix = np.asarray(training, dtype=np.float64)
-        n, a = len(matrix), components
+        if matrix.ndim != 2 or not np.all(np.isfinite(matrix)):
+            raise InputError(f"training must be a matrix of finite numbers, got shape {matrix.shape}")
+        (n, p), a = matrix.shape, components
+        if not 1 <= a <= p - 1:
+            raise InputError(f"components must be in [1, {p - 1}] for {p} signals, got {a}")
+        if n <= p:
+            raise InputError(f"training must have more rows than its {p} signals, got {n}")
         mean, scale = matrix.mean(axis=0), matrix.std(axis=0, ddof=1)
+        still = np.flatnonzero(scale <= 1e-12 * np.abs(mean))
+        if still.size:
+            raise InputError(f"training must vary in every signal, number {still[0]} does not; leave it out")
         _, singular, directions = np.linalg.svd((matrix - mean) / scale, full_matrices=False)
         variances = singular**2 / (n - 1)
+        if variances[a] < 1e-12:
+            raise InputError(f"components must leave some variance over, {a} of {p} signals leave none")
         t2 = a * (n * n - 1) / (n * (n - a)) * float(stats.f.isf(false_alarm, a, n - a))
         spe = _jackson_mudholkar_limit(variances[a:], false_alarm)
         return cls(mean.tolist(), scale.tolist(), directions[:a].T.tolist(), variances.tolist(), n, t2, spe)

@@ -95,6 +95,21 @@ def test_a_damaged_memory_is_refused() -> None:
         ParameterT2.resume(memory)
 
 
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ((NAMES, np.eye(2), 16.0), "root must be rows of 3 finite numbers, one a parameter"),
+        ((NAMES, np.zeros((0, 3)), 16.0), "root must have a row for each direction that is charted, got none"),
+        ((NAMES, np.eye(3), 0.0), "limit must be a positive number, got 0.0"),
+        ((NAMES, np.eye(3), 16.0, np.eye(2)), "inputs must be rows of 3 finite numbers"),
+        ((NAMES, np.eye(3), 16.0, None, 1.0), r"forgetting must be in \(0, 1\), got 1.0"),
+    ],
+)
+def test_settings_out_of_range_are_named(arguments: tuple[object, ...], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        ParameterT2(*arguments)  # type: ignore[arg-type]
+
+
 @pytest.mark.parametrize(("dimension", "weight"), [(1, 0.1), (3, 0.01), (7, 0.001)])
 def test_the_limit_with_everything_known_is_that_of_the_mewma(dimension: int, weight: float) -> None:
     limit = parameter_limit(1e4, dimension, weight, 1e7, 0.0)
@@ -356,6 +371,11 @@ def test_a_training_with_one_step_of_the_input_does_not_determine_how_its_lags_s
         ({"forgetting": 1.0}, r"forgetting must be in \[0.966667, 0.9999\], got 1.0"),
         ({"forgetting": 0.95}, r"forgetting must be in \[0.966667, 0.9999\], got 0.95"),
         ({"arl0": 1.0}, r"arl0 must be in \[10.0004, 1e\+08\], got 1.0"),
+        ({"regressors": np.zeros((500, 3))}, "regressors must vary or have an offset, all of them are 0"),
+        ({"residuals": np.full(500, np.nan)}, "regressors and residuals must be finite numbers"),
+        ({"residuals": np.zeros(499)}, r"as many rows as there are residuals, got \(500, 3\) and \(499,\)"),
+        ({"past_outputs": 4}, r"past_outputs must be in \[0, 3\], got 4"),
+        ({"reference_rows": 0}, "reference_rows must be in"),
     ],
 )
 def test_what_cannot_be_learned_is_named(changes: dict[str, object], message: str) -> None:

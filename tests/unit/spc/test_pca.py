@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from reactorwatch.arrays import Array
 from reactorwatch.errors import InputError
 from reactorwatch.spc.charts.base import JointChart
 from reactorwatch.spc.charts.mewma import Mewma
@@ -75,3 +76,22 @@ def test_a_covariance_that_is_none_is_refused() -> None:
         T2([0.0, 0.0], [[1.0, 0.1], [0.2, 1.0]], 10.0)
     with pytest.raises(InputError, match=r"covariance must have shape \(2, 2\)"):
         T2([0.0, 0.0], [[1.0]], 10.0)
+
+
+@pytest.mark.parametrize(
+    ("training", "components", "message"),
+    [
+        (np.ones((10, 3)), 1, "training must vary in every signal, number 0 does not"),
+        (np.eye(3), 1, "training must have more rows than its 3 signals, got 3"),
+        (np.random.default_rng(1).standard_normal((9, 3)), 3, r"components must be in \[1, 2\] for 3 signals, got 3"),
+        (np.full((9, 3), np.nan), 1, "training must be a matrix of finite numbers"),
+        (
+            np.outer(np.arange(9.0), np.ones(3)),
+            1,
+            "components must leave some variance over, 1 of 3 signals leave none",
+        ),
+    ],
+)
+def test_a_training_that_makes_no_model_is_refused(training: Array, components: int, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        PcaModel.fit(training, components)

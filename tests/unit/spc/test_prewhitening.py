@@ -80,3 +80,9 @@ def test_a_random_walk_is_not_taken_for_one() -> None:
 def test_few_rows_give_their_mean_and_deviation() -> None:
     learned = learn(np.array([1.0, 2.0, 3.0, np.nan]), 1e-9)
     assert (learned.constant, learned.coefficients, learned.sd) == (2.0, (), 1.0)
+
+
+def test_whole_numbers_are_filtered_like_others() -> None:
+    filters = [Prewhitener(Prewhitening((0.5,), 2.0)) for _ in range(2)]
+    for z in (1, 2, 3, 1):
+        np.testing.assert_equal(filters[0].update(z), filters[1].update(float(z)))
