@@ -83,6 +83,6 @@ def test_few_rows_give_their_mean_and_deviation() -> None:
 
 
 def test_whole_numbers_are_filtered_like_others() -> None:
-    filters = [Prewhitener(Prewhitening((0.5,), 2.0)) for _ in range(2)]
+    filters = [Prewhitener(Prewhitening(0.0, (0.5,), 2.0, 1000, 0.001, 0.001)) for _ in range(2)]
     for z in (1, 2, 3, 1):
         np.testing.assert_equal(filters[0].update(z), filters[1].update(float(z)))
