@@ -92,7 +92,8 @@ LARGEST_TEXT = 2_000_000_000
 """Most bytes of a compressed text or workbook: a small file cannot exhaust memory."""
 
 _COLUMN, _ROW = re.compile(rb'\br="([A-Z]+)\d'), re.compile(rb'\br="[A-Z]*(\d+)"')
-"""References of cells and rows in a sheet."""
+_CELL = re.compile(rb"<c[\s/>]")
+"""References of cells and rows in a sheet, and cells: `<cfRule` and `<col` are none."""
 
 _MAGIC = {b"\x1f\x8b": "gz", b"PK\x03\x04": "xlsx", b"\xd0\xcf\x11\xe0": "xls", b"PAR1": "parquet", b"\x89MCAP": "mcap"}
 _BYTE_ORDER_MARKS = {
@@ -222,7 +223,7 @@ def _unpack_workbook(path: Path, data: bytes) -> io.BytesIO:
             cells = 0
             if info.filename.startswith("xl/worksheets/"):
                 width = max(map(_column_number, set(_COLUMN.findall(content))), default=0)
-                width = max(width, *(row.count(b"<c") for row in content.split(b"<row")))
+                width = max(width, *(len(_CELL.findall(row)) for row in content.split(b"<row")))
                 cells = width * max(map(int, _ROW.findall(content)), default=0)
             if max(size, cells * 32) > LARGEST_TEXT:  # bytes of a cell in memory, empty or not
                 raise InputError(

@@ -3,7 +3,6 @@
 import re
 from collections.abc import Collection, Mapping, Sequence
 from itertools import combinations, pairwise
-from operator import eq
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -78,18 +77,17 @@ def find_qualities(
         is_named = _STRONG.search(name) is not None  # numbers that are no codes are a measured quality
         is_named &= all(_code(cell) is not None or is_text for cell in layout.cells(column) if cell.strip())
         is_quality = is_quality_name(name) or _FLAG.search(name) is not None
-        if not is_quality and is_text and _is_certain(layout, column, stated):  # under any name
-            of = [item for item in values if item != column]
-            parts = re.split(r"[\W_]+", name)
-            own, is_quality = [item for item in of if names[item] in parts], True
-            of = own or of
         if of and is_quality and (is_named or _is_certain(layout, column, stated)):
             found[column] = of
     return found
 
 
 def check_stated(layout: Layout, found: Collection[int], stated: FileFormat) -> None:
-    """Check that there are columns of qualities if good ones are stated."""
+    """Check that there are columns of qualities if good ones are stated.
+
+    Raises:
+        InputError: there is none.
+    """
     if stated.quality_good and not found:
         raise InputError(
             f"{layout.path}, row {layout.header_row or layout.first_row}: expected a column of qualities "
@@ -109,7 +107,16 @@ def _is_certain(layout: Layout, column: int, stated: FileFormat) -> bool:
 
 
 class QualityFilter:
-    """Removal of values whose quality is not good."""
+    """Removal of values whose quality is not good.
+
+    Args:
+        table: the table, which has the columns of qualities as texts.
+        columns: columns of values by their column of qualities; empty: all.
+        stated: statements of the user.
+
+    Raises:
+        InputError: a quality is neither known nor stated, or none is good.
+    """
 
     def __init__(self, table: TextTable, columns: Mapping[int, Collection[int]], stated: FileFormat) -> None:
         self.columns, self._names = columns, table.layout.names
@@ -168,7 +175,11 @@ def _key(name: str) -> str:
 def judge(
     cells: Sequence[str], header: str, stated: FileFormat, beside: Collection[str] = ()
 ) -> dict[str, bool | None]:
-    """Decide over all different cells of a column, with its header and those beside it: the code 0 has two meanings."""
+    """Decide over all different cells of a column, with its header and those beside it: the code 0 has two meanings.
+
+    Returns:
+        True for good, False for not good, None for unknown, by cell.
+    """
     codes = {cell: _code(cell) for cell in cells}
     if stated.quality_good:
         texts = (word for text in stated.quality_good for word in (text, *filter(None, text.split(","))))
@@ -229,10 +240,11 @@ def _judge_word(cell: str) -> bool | None:
     return True if signs and set(words[: signs[0][1]]) <= _NEUTRAL else None
 
 
-_TAG = re.compile(r"tag|point|signal|variable|sensor|channel|name", re.IGNORECASE)
-_ID = re.compile(rf"{_TAG.pattern}|(?:\b|_)id$|[a-z]I[Dd]$", re.IGNORECASE)
-_VALUE = re.compile(r"val|wert|reading", re.IGNORECASE)
-"""Headers of tags, of tags that are numbers, and of values: they decide where the rows leave it open."""
+_TAG = re.compile(r"tag|point|signal|variable|sensor|channel|mess(?:stelle|punkt)|kanal|name", re.IGNORECASE)
+_VALUE = re.compile(r"val|wert|reading|mess(?!.*zeit)", re.IGNORECASE)
+_ID = re.compile(rf"{_TAG.pattern}|(?:\b|_)id$|[a-z]I[Dd]$|device", re.IGNORECASE)
+"""Headers of tags, and of those that are numbers."""
+_UNIT = re.compile(r"unit|uom|einheit", re.IGNORECASE)
 
 SHARED, SORTED, RESTARTING, ALTERNATING, REGULAR = "shared", "sorted", "restarting", "alternating", "regular"
 """Arrangements of rows: several have one time; they are sorted by tag, on a clock, or with minutes that start again as
@@ -240,10 +252,14 @@ those of batches do; tags alternate, or so do the labels of rows at regular time
 
 MAX_TAGS = 0.5
 """Largest share of different tags among the rows."""
+MIN_DISTINCT = 0.9
+"""Smallest share of steps from a value of a tag to its next at which the time goes on."""
 MIN_SHARED = 1 / 6
 """Smallest share of rows with the time of the row before; it is 1/2 for two tags that are sampled together."""
 MIN_CHANGES = 0.1
 """Smallest share of rows with another tag than the row before, if each tag has times of its own."""
+MIN_EXPLAINED = 0.9
+"""Smallest share of the variance that tags of different quantities explain."""
 
 
 class LongFormat(NamedTuple):
@@ -259,6 +275,9 @@ def find_long_format(layout: Layout, stated: FileFormat, names: Collection[str])
     """Find the columns of a long table, as stated or by its rows; None if it is wide.
 
     A table with columns that are asked for by their `names`, beside that of values, is wide.
+
+    Raises:
+        InputError: a stated column is not there, or it is not known which column holds the values.
     """
     headers, kinds, columns = layout.names, layout.kinds, range(len(layout.names))
     is_stated = stated.tag is not None or stated.value is not None
@@ -269,9 +288,7 @@ def find_long_format(layout: Layout, stated: FileFormat, names: Collection[str])
     tags, values = (_option_columns(layout, f"--{name}", getattr(stated, name)) for name in ("tag", "value"))
     if set(tags) & set(values):
         raise InputError(f"--tag and --value must name different columns, got {stated.tag!r} and {stated.value!r}")
-    is_likely = is_stated or TEXT in kinds or any(map(_ID.search, headers))
-    codes = [item for item in columns if kinds[item] == NUMBER and item not in asked and _is_code(layout, item)]
-    if not is_likely and not (codes and any(_repeats(layout, item) for item in columns if item not in codes)):
+    if not (is_stated or TEXT in kinds or any(map(_ID.search, headers))):
         return None
     numbered = {int(name) - 1 for name in names if name.isdigit() and layout.header_row is None}
     time = choose_time(layout, stated, {*tags, *values, *asked, *numbered})
@@ -280,9 +297,9 @@ def find_long_format(layout: Layout, stated: FileFormat, names: Collection[str])
     free = [column for column in free if column not in qualities]
     numbers = [item for item in free if kinds[item] == NUMBER]
     likely = [item for item in numbers if _VALUE.search(headers[item])]
-    texts = [item for item in free if kinds[item] == TEXT and item not in asked]
+    texts = [item for item in free if kinds[item] == TEXT and item not in asked and not _UNIT.search(headers[item])]
     named = [item for item in texts if _TAG.search(headers[item])] or (texts[:1] if layout.header_row is None else [])
-    ids = [item for item in numbers if item not in asked and (_ID.search(headers[item]) or item in codes)]
+    ids = [item for item in numbers if item not in asked and _ID.search(headers[item])]
     parts = list(dict.fromkeys((*named, *texts, *ids)))
     choices = [tags] if tags else [choice for size in (1, 2) for choice in combinations(parts, size)]
     if not choices or not time.columns:
@@ -298,8 +315,6 @@ def find_long_format(layout: Layout, stated: FileFormat, names: Collection[str])
         index = np.asarray(labels.indices, dtype=np.intp)
         known = {*labels.dictionary.to_pylist(), *map(bare_name, labels.dictionary.to_pylist())}
         shape = "" if "" in known else _arrange(times, index)
-        is_code = any(item in codes and not _ID.search(headers[item]) for item in choice)
-        shape = "" if is_code and shape != SHARED else shape  # a state, such as that of a valve
         is_given = bool(tags or (values and len(labels.dictionary) > 1) or (words & known and not asked))
         is_named = not asked and choice[0] in named and len(choice) == 1
         if not (shape or is_given or is_named):
@@ -313,8 +328,7 @@ def find_long_format(layout: Layout, stated: FileFormat, names: Collection[str])
             continue
         signs = (
             value is not None and _VALUE.search(headers[value]) is not None,
-            value is not None
-            and _variance_share(TextTable(layout, minutes, [value]), value, index) >= 0.9,  # different quantities
+            value is not None and _variance_share(TextTable(layout, minutes, [value]), value, index) >= MIN_EXPLAINED,
             all(re.search(r"\d", label) for label in known),
         )
         is_shown = shape in (SHARED, SORTED) or (shape == RESTARTING and any(signs[:2]))
@@ -357,18 +371,6 @@ def _tag_cells(table: TextTable, columns: Sequence[int]) -> Any:
     return pc.binary_join_element_wise(*(pc.utf8_trim_whitespace(table.texts(column)) for column in columns), ".")
 
 
-def _is_code(layout: Layout, column: int) -> bool:
-    """True for a column of few different whole numbers."""
-    cells = layout.cells(column)
-    return all(cell.strip().isdecimal() for cell in cells) and 1 < len(set(cells)) <= MAX_TAGS * len(cells)
-
-
-def _repeats(layout: Layout, column: int) -> bool:
-    """True for a column, such as the time, with many cells like that of the row before."""
-    cells = layout.cells(column)
-    return bool(sum(map(eq, cells[1:], cells)) >= MIN_SHARED * len(cells))
-
-
 def _has_fractions(layout: Layout, column: int, _: Sequence[int]) -> bool:
     """True for a column of numbers that are not all whole, as codes and counts are."""
     return any("." in cell or "," in cell for cell in layout.cells(column))
@@ -378,7 +380,7 @@ def _varies(layout: Layout, column: int, tags: Sequence[int]) -> bool:
     """True for a column of numbers that do not count the rows and differ between rows of one tag."""
     known = [tuple(row[part] for part in tags) for row in layout.sample]
     pairs = set(zip(known, layout.cells(column), strict=True))
-    return len(pairs) > len(set(known)) and not (column == 0 and counts_rows(layout, column))
+    return len(pairs) > len(set(known)) and not counts_rows(layout, column)
 
 
 def _variance_share(table: TextTable, column: int, tags: NDArray[np.intp]) -> float:
@@ -401,14 +403,14 @@ def _arrange(times: NDArray[Any], tags: NDArray[np.intp]) -> str:
         return ""  # most wide tables, without sorting
     order = np.argsort(tags, kind="stable")
     inner = np.diff(times[order])[np.diff(tags[order]) == 0]
-    if max(np.mean(inner > 0), np.mean(inner < 0)) < 0.9:  # times of a tag are in order, but for repeats
+    if max(np.mean(inner > 0), np.mean(inner < 0)) < MIN_DISTINCT:
         return ""
     steps = steps if np.median(inner) > 0 else -steps  # the newest may be first
     if np.mean(steps == 0) >= MIN_SHARED:
         return SHARED
     if (steps < 0).any() and changed[steps < 0].all():
         return SORTED if times.dtype.kind == "i" else RESTARTING
-    is_regular = np.mean(np.isclose(steps, np.median(steps), rtol=0.1)) > 0.9 and changes < 0.9
+    is_regular = np.mean(np.isclose(steps, np.median(steps), rtol=0.1)) > MIN_DISTINCT and changes < MIN_DISTINCT
     return "" if changes < MIN_CHANGES else REGULAR if is_regular else ALTERNATING
 
 
@@ -422,7 +424,11 @@ class TagSeries(NamedTuple):
 def read_tags(
     layout: Layout, long: LongFormat, stated: FileFormat, wanted: Collection[str] | None
 ) -> tuple[dict[str, TagSeries], bool, list[str]]:
-    """Series by tag, all or those wanted; True if their times are nanoseconds since 1970; and guesses, for people."""
+    """Series by tag, all or those wanted; True if their times are nanoseconds since 1970; and guesses, for people.
+
+    Raises:
+        InputError: a cell of a tag that is read is no time or no number, or its quality is unknown.
+    """
     stamps, minutes = _split_time(long.time)
     table = TextTable(layout, minutes, [*long.tags, long.value, *long.qualities, *stamps])
     tags = _tag_cells(table, long.tags).dictionary_encode()

@@ -197,7 +197,7 @@ def _sources(
     sources, count = [], Counter(bare)
     for column, name in enumerate(layout.names):
         is_unnamed = layout.header_row is not None and name == str(column + 1)
-        is_unnamed = is_unnamed and (layout.kinds[column] == EMPTY or (column == 0 and counts_rows(layout, column)))
+        is_unnamed = is_unnamed and (layout.kinds[column] == EMPTY or counts_rows(layout, column))
         if column in others or name == RUN_COLUMN or is_unnamed or layout.kinds[column] not in (NUMBER, EMPTY):
             continue
         own = bare[column] if count[bare[column]] == 1 else name

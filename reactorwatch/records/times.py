@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reactorwatch.errors import InputError
-from reactorwatch.records.cells import NUMBER, TIME, to_numbers
+from reactorwatch.records.cells import NUMBER, TIME
 from reactorwatch.records.file_format import SECONDS, FileFormat
 from reactorwatch.records.record import LONGEST_MIN, MINUTE_NS, to_time_ns
 from reactorwatch.records.table import Layout, TextTable, bare_name
@@ -32,9 +32,11 @@ STANDARD = {"time_min": "min", "time_s": "s"}
 MAX_SHARE_BACK = 1 / 3
 """Largest share of rows with a step back in time; a file with more is not in time order."""
 
-_TIME_WORDS = frozenset(["time", "zeit", "t", "ts", "timestamp", "datetime", "date", "datum", "elapsed", "clock"])
-"""Names of times: they decide where several columns increase, or one does in steps that differ."""
-
+_TIME_NAMES = """
+time zeit t ts tstamp timestamp datetime date datum uhrzeit zeitstempel zeitpunkt elapsed epoch unix clock temps heure
+horodatage fecha hora tiempo tempo seconds minutes hours sekunden minuten stunden x_value"""
+_INDEX_NAMES = "index idx sample samples row rows nr no n i k step steps id # zeile schritt"
+_TIME_WORDS, _INDEX_WORDS = frozenset(_TIME_NAMES.split()), frozenset(_INDEX_NAMES.split())
 _UNIT_WORDS = (
     "ns",
     "us µs",
@@ -45,6 +47,7 @@ _UNIT_WORDS = (
     "d day days tage",
 )
 _UNIT_OF = {word: words.split()[0] for words in _UNIT_WORDS for word in words.split()}
+PLAIN = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?")
 _EPOCH_S, _EPOCH_UNITS_S = (6.3e8, 4.2e9), (1.0, 1e-3, 1e-6, 1e-9)
 """Smallest and largest Unix times of 1990 to 2100, and their units in seconds."""
 _SERIAL_DAYS, _SERIAL_ZERO, _SERIAL_STEP = (32_874, 73_050), 25_569, 0.05
@@ -69,7 +72,16 @@ class TimeColumn:
 
 
 def choose_time(layout: Layout, stated: FileFormat, taken: Collection[int]) -> TimeColumn:
-    """Choose the time column."""
+    """Choose the time column.
+
+    Args:
+        layout: the table.
+        stated: statements of the user.
+        taken: columns of signals.
+
+    Raises:
+        InputError: none or several could be it.
+    """
     if stated.period is not None:
         return TimeColumn(())
     if stated.time is not None:
@@ -95,14 +107,16 @@ def choose_time(layout: Layout, stated: FileFormat, taken: Collection[int]) -> T
             cells = [f"{one} {other}" for one, other in zip(*map(layout.cells, columns), strict=True)]
             return TimeColumn(columns, pattern=guess_pattern(cells))
     stamps = [item for item in stamps if len(set(layout.cells(item.columns[0]))) > 2] or stamps  # not a query's ends
-    numbers = [item for item in candidates if item.pattern is None and layout.kinds[item.columns[0]] == NUMBER]
-    named = [item for item in numbers if _has_time_name(layout, item)]
+    named = [
+        item
+        for item in candidates
+        if item.pattern is None and layout.kinds[item.columns[0]] == NUMBER and _has_time_name(layout, item)
+    ]
     found = [*stamps, *(item for item in named if _increases(layout, item))]
     if not found:
-        numbers = [item for item in numbers if _increases(layout, item)]
+        numbers = [item for item in candidates if _increases(layout, item)]
         found = [item for item in numbers if find_epoch(layout, item, sample_values(layout, item.columns[0]))]
-        regular = [item for item in numbers if counts_rows(layout, item.columns[0])]
-        found = found or [item for item in regular if not _is_index(layout, item)] or regular or named
+        found = found or [item for item in numbers if counts_rows(layout, item.columns[0])] or named
     if len(found) > 1:
         names = ", ".join(repr(layout.names[item.columns[0]]) for item in found)
         raise InputError(f"{layout.path}: {len(found)} columns could be the time: {names}; state --time NAME")
@@ -139,38 +153,25 @@ def _has_time_name(layout: Layout, item: TimeColumn) -> bool:
 
 
 def counts_rows(layout: Layout, column: int) -> bool:
-    """True for a column of numbers in equal steps, up or down, but for gaps."""
+    """True for a first column that counts the rows or their times, under a name that says nothing."""
+    name = layout.names[column].lower()
     values = sample_values(layout, column)
     steps = np.diff(values)
-    if not steps.size or not ((steps > 0).all() or (steps < 0).all()):
+    if column != 0 or not steps.size or float(np.ptp(steps)) > 1e-6 * max(abs(values[-1]), steps[0]):
         return False
-    usual = float(np.median(steps))
-    is_usual = np.abs(steps - usual) <= 1e-6 * max(abs(values[0]), abs(values[-1]), abs(usual))
-    return bool(np.mean(is_usual) >= 0.9)  # totals have no equal steps
-
-
-def _is_index(layout: Layout, item: TimeColumn) -> bool:
-    """True for the numbers of the rows."""
-    values = sample_values(layout, item.columns[0])
-    return values[0] in (0.0, 1.0) and bool((np.diff(values) == 1.0).all()) and not item.unit
+    return steps[0] > 0 and (layout.header_row is None or name == "1" or name in _INDEX_WORDS)
 
 
 def sample_values(layout: Layout, column: int) -> NDArray[np.float64]:
     """Numbers in the sample of a column, without cells that are none."""
-    cells = [cell for cell in layout.cells(column) if cell.strip() not in layout.missing]
-    group = "." if layout.decimal == "," else ","
-    try:
-        values = np.array([float("x" if group in cell else cell.replace(",", ".")) for cell in cells])
-    except ValueError:  # thousands in groups, or texts: ten times as slow
-        import pyarrow as pa
-
-        values, _ = to_numbers(pa.array(cells), layout.decimal, layout.missing)
-    return np.asarray(values[np.isfinite(values)])
+    cells = [cell.strip().replace(",", ".") for cell in layout.cells(column)]
+    return np.array([float(cell) for cell in cells if PLAIN.fullmatch(cell)])
 
 
 def _increases(layout: Layout, item: TimeColumn) -> bool:
     steps = np.diff(sample_values(layout, item.columns[0]))
-    return bool(np.count_nonzero(steps <= 0) <= MAX_SHARE_BACK * steps.size) or counts_rows(layout, item.columns[0])
+    is_ordered = bool(np.count_nonzero(steps <= 0) <= MAX_SHARE_BACK * steps.size)
+    return is_ordered and layout.kinds[item.columns[0]] == NUMBER
 
 
 class Epoch(NamedTuple):
@@ -217,9 +218,20 @@ def _refuse_without_time(layout: Layout, taken: Collection[int]) -> None:
     )
 
 
+MIN_REVERSED = 3
+"""Fewest rows of a file that may have its newest row first."""
+
+
 @dataclass(frozen=True)
 class Times:
-    """Times of the rows."""
+    """Times of the rows.
+
+    Attributes:
+        values: minutes, or nanoseconds since 1970-01-01 UTC; shape (rows,).
+        valid: False where a row has no time, shape (rows,).
+        is_clock: the times are clock times, in nanoseconds.
+        notes: guesses, for people.
+    """
 
     values: NDArray[np.float64] | NDArray[np.int64]
     valid: NDArray[np.bool_]
@@ -235,7 +247,11 @@ class Times:
 
 
 def read_times(table: TextTable, column: TimeColumn, stated: FileFormat) -> Times:
-    """Read the times of the rows."""
+    """Read the times of the rows.
+
+    Raises:
+        InputError: a cell is no time, or local times are ambiguous.
+    """
     if stated.period is not None:
         minutes = np.arange(table.rows, dtype=np.float64) * (stated.period_s or 0.0) / 60.0
         return Times(minutes, np.isfinite(minutes), is_clock=False, notes=[f"a row each {stated.period}"])
@@ -256,13 +272,13 @@ def read_times(table: TextTable, column: TimeColumn, stated: FileFormat) -> Time
     unit = column.unit or "s"
     notes = [] if column.is_standard else [f"time {name} in {unit}"]
     seconds = SECONDS[unit]  # whole factors, so that decimal times stay exact
-    minutes = values * (seconds / 60.0) if seconds > 60.0 else values / (60.0 / seconds)
+    minutes = values * (seconds / 60.0) if seconds > 60.0 else values / units_per_minute(unit)
     return Times(minutes, valid, is_clock=False, notes=notes)
 
 
 def is_newest_first(layout: Layout, column: TimeColumn, dates: str | None) -> bool:
     """True if the first rows are before the rows above them, but for blocks that were written again."""
-    if not column.columns or len(layout.sample) < 3:
+    if not column.columns or len(layout.sample) < MIN_REVERSED:
         return False
     if column.pattern is None:
         steps = np.diff(sample_values(layout, column.columns[0]))
@@ -281,17 +297,21 @@ def find_written_zero_ns(layout: Layout, column: TimeColumn, taken: Collection[i
     if not column.is_standard or column.unit != "min" or CLOCK_COLUMN not in layout.names or not layout.sample:
         return 0
     at = layout.names.index(CLOCK_COLUMN)
-    cell = layout.sample[0][at]
+    cell, minutes = layout.sample[0][at], layout.sample[0][column.columns[0]].strip()
     pattern = guess_pattern([cell])
-    if at in taken or pattern is None or not pattern.has_date:
+    if at in taken or pattern is None or not pattern.has_date or not PLAIN.fullmatch(minutes):
         return 0
     import pyarrow as pa
 
     instants, form = parse(pa.array([cell]), pattern)
-    minutes, _ = to_numbers(pa.array([layout.sample[0][column.columns[0]]]), layout.decimal, layout.missing)
-    if form is None or not instants.valid[0] or not np.isfinite(instants.offset_s[0] + minutes[0]):
+    if form is None or not instants.valid[0] or not np.isfinite(instants.offset_s[0]):
         return 0
-    return int(instants.local_ns[0]) - int(instants.offset_s[0]) * 1_000_000_000 - to_time_ns(float(minutes[0]))
+    return int(instants.local_ns[0]) - int(instants.offset_s[0]) * 1_000_000_000 - to_time_ns(float(minutes))
+
+
+def units_per_minute(unit: str) -> float:
+    """Units of time in a minute."""
+    return 60.0 / SECONDS[unit]
 
 
 def _read_stamps(table: TextTable, column: TimeColumn, pattern: Pattern, stated: FileFormat, name: str) -> Times:
@@ -364,7 +384,7 @@ def numbered_runs(table: TextTable, column: int | None) -> NDArray[np.intp] | No
     if column is None:
         return None
     cells = [cell.strip() for cell in table.texts(column).to_pylist()]
-    if not all(cell.isdecimal() and len(cell) < 18 for cell in cells):
+    if not all(cell.isdecimal() and len(cell) < LONGEST_NUMBER for cell in cells):
         return None
     runs = np.array([int(cell) for cell in cells], dtype=np.intp)
     steps = np.diff(runs, prepend=0)
@@ -379,7 +399,11 @@ def check_times(
     runs: NDArray[np.intp] | None,
     rows: NDArray[np.intp],
 ) -> None:
-    """Check that each row has a time in the range of a record's, and another one than the row before."""
+    """Check that each row has a time in the range of a record's, and another one than the row before.
+
+    Raises:
+        InputError: a row has not.
+    """
     if not minutes.size:
         raise InputError(f"{table.layout.path}: expected rows below the header, got none")
     ends = np.abs(minutes[[0, -1]])
@@ -397,7 +421,7 @@ def check_times(
     at = int(np.flatnonzero(wrong)[0])
     row = int(rows[at])
     if times.valid[row] and not np.abs(minutes[at]) <= LONGEST_MIN:
-        most = f"{LONGEST_MIN * 60.0 / SECONDS[time.unit or 's']:.3g}"
+        most = f"{LONGEST_MIN * units_per_minute(time.unit or 's'):.3g}"
         rule = f"expected a time within 146 years of its zero ({most} at most)"
         table.refuse(row, column, rule, "check its unit: seconds are time_s")
     if np.isinf(minutes[at]):
@@ -415,7 +439,11 @@ def check_times(
 def find_runs(
     layout: Layout, time: TimeColumn, minutes: NDArray[np.float64], numbered: NDArray[np.intp] | None
 ) -> NDArray[np.intp] | None:
-    """Number of each row's run, from 1; None for one run."""
+    """Number of each row's run, from 1; None for one run.
+
+    Raises:
+        InputError: the time steps back too often for rows in time order.
+    """
     if numbered is None and (minutes[1:] >= minutes[:-1]).all():
         return None
     back = starts = np.diff(minutes, prepend=minutes[0]) < 0
@@ -429,3 +457,7 @@ def find_runs(
             f"{np.count_nonzero(back)} of {minutes.size} rows; sort the rows by time"
         )
     return 1 + np.cumsum(starts) if starts.any() else None
+
+
+LONGEST_NUMBER = 18
+"""Most digits of a run's number."""

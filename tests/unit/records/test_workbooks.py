@@ -3,12 +3,13 @@
 import io
 import sys
 import zipfile
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from datetime import date, datetime, time, timedelta
 from pathlib import Path
 
 import openpyxl
 import pytest
+from openpyxl.formatting.rule import ColorScaleRule
 from typer.testing import CliRunner
 
 import reactorwatch as rw
@@ -23,12 +24,12 @@ from reactorwatch.records.write import write_table
 from tests.unit.records.variants import HOLES, START, UNITS, VALUES, clock
 
 Sheets = dict[str, Sequence[Sequence[object]]]
-ROWS: list[list[object]] = [[k, 10.0 + k] for k in range(30)]
+ROWS = [[k, 10.0 + k] for k in range(30)]
 SHEETS: Sheets = {
     "Cover": [["Report of rig 7"], ["made", "by hand"], ["number", 3]],
     "empty": [],
     "Data": [["time_s", "T"], *ROWS],
-    "Backup": [["time_s", "T"], *([k, -10.0 - k] for k in range(30))],
+    "Backup": [["time_s", "T"], *([k, -value] for k, value in ROWS)],
 }
 
 
@@ -48,7 +49,7 @@ def test_a_workbook_reads_like_its_text(tmp_path: Path) -> None:
         [time.replace(tzinfo=None), *(None if hole else value for value, hole in zip(row, holes, strict=True))]
         for time, row, holes in zip(clock(), VALUES.tolist(), HOLES.tolist(), strict=True)
     ]
-    rows: list[list[object]] = [["Anlage 7"], ["Zeit", "qc [l/min]", "C [mol/l]", "T [K]"], *values]
+    rows = [["Anlage 7"], ["Zeit", "qc [l/min]", "C [mol/l]", "T [K]"], *values]
     record = read_table(write(tmp_path / "book.xlsx", {"empty": [], "Daten": rows}))
     assert record.zero == f"{START:%Y-%m-%dT%H:%M:%SZ}"
     assert record.units == UNITS
@@ -151,7 +152,7 @@ def _replaced(sheet: bytes) -> bytes:
     return file.getvalue()
 
 
-BOMBS: dict[str, Callable[[], bytes]] = {
+BOMBS = {
     "a cell far from the others": _far_cell,
     "cells without references": lambda: _replaced(
         b"<worksheet><sheetData><row r='1'>%s</row><row r=\"1048576\"><c><v>1</v></c></row></sheetData></worksheet>"
@@ -171,6 +172,19 @@ def test_a_workbook_that_memory_could_not_hold_is_refused(
     with pytest.raises(InputError, match=r"book\.xlsx: expected sheets that unpack to at most 0\.01 GB, got more in"):
         read_table(path)
     assert read_table(write(tmp_path / "sound.xlsx", {"Data": SHEETS["Data"]})).rows == len(ROWS)
+
+
+def test_rules_and_widths_of_columns_are_no_cells(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(decode, "LARGEST_TEXT", 1_000_000)
+    book = openpyxl.Workbook()
+    for row in SHEETS["Data"]:
+        book.active.append(row)
+    for k in range(1, 800):
+        scale = ColorScaleRule(start_type="min", start_color="FF0000", end_type="max", end_color="00FF00")
+        book.active.conditional_formatting.add(f"B{k}", scale)
+    path = tmp_path / "book.xlsx"
+    book.save(path)
+    assert read_table(path).rows == len(ROWS)
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,6 @@
 import csv
 import gzip
 import io
-import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta, timezone
@@ -268,26 +267,3 @@ def _variants() -> dict[str, Variant]:
 
 
 VARIANTS = _variants()
-
-_STANDARD = {"time_min": "min", "time_s": "s", "t_ms": "ms"}
-_WORDS = "time timestamp datetime date datum uhrzeit zeit t ts elapsed sample x_value tag value quality remark comment status n2"
-_HEADER_WORD = re.compile(rf"(?<![\w\[/])(?:{'|'.join((*_STANDARD, *_WORDS.split()))})(?![\w\]])", re.IGNORECASE)
-
-
-def rename(variant: Variant) -> Variant:
-    """The variant with an arbitrary word for each word of its header; signals keep their names, and units stay."""
-    arbitrary: dict[str, str] = {}
-
-    def word(match: re.Match[str]) -> str:
-        known = match[0]
-        if known == "T":
-            return known
-        made = arbitrary.setdefault(known, f"blick{'abcdefghij'[len(arbitrary)]}")
-        return f"{made}_{_STANDARD[known]}" if known in _STANDARD else made
-
-    time = variant.stated.time
-    changed = variant.content.decode()
-    changed = _HEADER_WORD.sub(word, changed)
-    return replace(
-        variant, content=changed.encode(), stated=replace(variant.stated, time=arbitrary.get(time or "", time))
-    )
