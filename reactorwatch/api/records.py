@@ -196,7 +196,9 @@ def read_record(
     for name in {"missing", "quality_good"} & form.keys():
         words = (form[name],) if isinstance(form[name], str | float | int) else form[name]
         form[name] = tuple(map(str, words))
-    stated = FileFormat(**{name: str(value) if type(value) is int else value for name, value in form.items()})
+    for name in {"time", "tag", "value", "sheet"} & form.keys():
+        form[name] = form[name] if form[name] is None else str(form[name])
+    stated = FileFormat(**form)
     names = dict(columns or {})
     if hasattr(file, "__arrow_c_stream__") or hasattr(file, "__dataframe__"):
         described = find_process(process or DEFAULT_PROCESS)

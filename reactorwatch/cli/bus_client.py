@@ -3,7 +3,7 @@
 import logging
 import threading
 import time
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from google.protobuf.message import Message
 
@@ -11,14 +11,15 @@ from reactorwatch.cli.option_groups import BusOptions, ClientOptions, PlantOptio
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, decode, encode_message
 from reactorwatch.contract.messages_pb2 import CommandReply
-from reactorwatch.description.find import PlantProcesses, find_process
-from reactorwatch.description.process import Process
 from reactorwatch.errors import InputError
 from reactorwatch.runtime.bus_zenoh import connect
 from reactorwatch.runtime.config import BusConfig, LogConfig, MetricsConfig, read_settings, section
 from reactorwatch.runtime.event_loop import StopSignal
 from reactorwatch.runtime.logs import configure
 from recorder.config import RecorderConfig
+
+if TYPE_CHECKING:
+    from reactorwatch.description.process import Process
 
 
 def load_settings(target: BusOptions, level: int = logging.WARNING) -> tuple[dict[str, dict[str, Any]], BusConfig]:
@@ -34,8 +35,10 @@ def load_recorder_settings(target: PlantOptions, level: int = logging.WARNING) -
     return bus, section(RecorderConfig, "recorder", tables, {"plant": target.name})
 
 
-def observed_process(process: str | None, recorder: RecorderConfig) -> Process | None:
+def observed_process(process: str | None, recorder: RecorderConfig) -> "Process | None":
     """Process of the plant that is observed."""
+    from reactorwatch.description.find import PlantProcesses, find_process
+
     return PlantProcesses(recorder.processes).find(recorder.plant) if process is None else find_process(process)
 
 

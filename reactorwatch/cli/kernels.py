@@ -6,6 +6,8 @@ So all kernels run here once, over a short simulated record: by `make setup`, by
 this version on a machine is ready.
 """
 
+import hashlib
+import os
 import sys
 from contextlib import suppress
 from pathlib import Path
@@ -48,19 +50,31 @@ def compile_kernels() -> None:
     prepare([PlantKind(ANY, MonitorConfig(), None)], points=False)
     log.info("compiling the numerical kernels", part=f"{parts}/{parts}", of="diagnosis")
     diagnose(record, cstr())
-    with suppress(OSError):  # nothing can be cached there, either
+    with suppress(OSError):
         _mark().parent.mkdir(parents=True, exist_ok=True)
         _mark().touch()
 
 
 def compile_at_first_start() -> None:
-    """Compile the kernels if this version never did so on this machine, for this user."""
-    if not _mark().exists():
+    """Compile the kernels if this installation never did so for this user; not where no mark of it can be left."""
+    if _mark().exists():
+        return
+    try:
+        _mark().parent.mkdir(parents=True, exist_ok=True)
+        writable = os.access(_mark().parent, os.W_OK)
+    except OSError:
+        writable = False
+    if writable:
         log.info("first start of this version: compiling once, half a minute")
         compile_kernels()
+    else:
+        log.warning("kernels are compiled when they are first called", why=f"{_mark().parent} cannot be written to")
 
 
 def _mark() -> Path:
-    """File that shows that the kernels of this version are compiled."""
+    """File that shows that the kernels of this version are compiled where this installation looks for them."""
     python = f"{sys.version_info.major}.{sys.version_info.minor}"
-    return platformdirs.user_cache_path("reactorwatch") / f"kernels-{version()}-python{python}-numba{numba.__version__}"
+    place = f"{Path(__file__).resolve()} {os.environ.get('NUMBA_CACHE_DIR', '')}"
+    digest = hashlib.blake2b(place.encode(), digest_size=6).hexdigest()
+    name = f"kernels-{version()}-python{python}-numba{numba.__version__}-{digest}"
+    return platformdirs.user_cache_path("reactorwatch") / name

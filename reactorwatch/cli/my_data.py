@@ -295,7 +295,7 @@ def causes(
     with task(f"comparing the causes of {described.name}"):
         found = identifiability(model, described.causes, run)
     show = as_json_text if as_json else as_matrix
-    print_report(show(found, described.name, run.time_min.size), as_json=as_json)
+    print_lines(*show(found, described.name, run.time_min.size).split("\n"))  # its matrix is not to be wrapped
 
 
 def simulate(

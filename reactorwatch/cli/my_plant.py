@@ -175,7 +175,7 @@ def monitor(
 
 def status(
     *,
-    nodes: Annotated[list[str] | None, Argument(help="With --check: these nodes [plant, monitor, recorder].")] = None,
+    nodes: Annotated[list[str] | None, Argument(help="With --check: these nodes [all that publish health].")] = None,
     target: ClientOptions,
     chosen: ProcessOption,
     check: Annotated[

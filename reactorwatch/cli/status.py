@@ -29,7 +29,6 @@ from reactorwatch.runtime.bus_zenoh import ZenohBus, connect, connect_now
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.event_loop import StopSignal, stop_on_signals
 from reactorwatch.terminal import printable
-from recorder.samples import measured_value
 
 if TYPE_CHECKING:
     from reactorwatch.description.process import Process
@@ -156,6 +155,8 @@ class StatusBoard:
 
     def _signals(self, plant: str) -> dict[str, dict[str, Any]]:
         """Newest value of each signal; null where none was received or measured."""
+        from recorder.samples import measured_value  # imports NumPy, which `status --check` does without
+
         newest = self._newest.get(plant, {})
         described = {} if self._process is None else {signal.name: signal for signal in self._process.signals}
         signals: dict[str, dict[str, Any]] = {}
@@ -217,13 +218,32 @@ def run(
 
 
 def check_alive(config: BusConfig, plant: str, nodes: Sequence[str], timeout_s: float, *, as_json: bool) -> int:
-    """Wait until nodes of a plant are alive, by their liveliness tokens, and print which are."""
+    """Wait until nodes of a plant are alive, by their liveliness tokens, and print which are.
+
+    Args:
+        config: settings of the bus.
+        plant: name of the plant.
+        nodes: names of the nodes; empty: all that publish health, at least one.
+        timeout_s: longest wait, in seconds.
+        as_json: True to print one JSON object.
+
+    Returns:
+        0 if they are alive, else 1.
+    """
     alive: set[str] = set()
+    healthy: set[str] = set()
     changed, stop = threading.Condition(), StopSignal()
     until_s = time.monotonic() + timeout_s
 
-    def wanted_nodes() -> Sequence[str]:
-        return nodes or ("replay" if "replay" in alive else "plant", "monitor", "recorder")
+    def are_alive() -> bool:
+        return alive.issuperset(nodes or healthy) and bool(nodes or healthy)
+
+    def on_health(message: Encoded) -> None:
+        topic = keys.parse(message.key)
+        if topic is not None:
+            with changed:
+                healthy.add(topic.name)
+                changed.notify_all()
 
     def on_token(key: str, is_alive: bool) -> None:
         topic = keys.parse(key)
@@ -241,18 +261,23 @@ def check_alive(config: BusConfig, plant: str, nodes: Sequence[str], timeout_s: 
     if bus is not None:
         try:
             bus.subscribe_liveliness(keys.all_keys(plant, keys.ALIVE), on_token)
+            if not nodes:
+                bus.subscribe(keys.all_keys(plant, keys.HEALTH), on_health, history_s=HISTORY_S)
             with changed:
-                changed.wait_for(lambda: alive.issuperset(wanted_nodes()), max(until_s - time.monotonic(), 0.0))
+                changed.wait_for(are_alive, max(until_s - time.monotonic(), 0.0))
         finally:
             bus.close()
-    found = {node: node in alive for node in wanted_nodes()}
+    with changed:
+        found = {node: node in alive for node in nodes or sorted(healthy)}
     if as_json:
         states = [{"node": node, "alive": is_alive} for node, is_alive in found.items()]
         print_screen_text(json_line({"plant": plant, "nodes": states}))
     else:
         for node, is_alive in found.items():
             print_lines(f"{node} is {'alive' if is_alive else f'not there within {timeout_s:g} s'}")
-    return 0 if all(found.values()) else 1
+        if not found:
+            print_lines(f"no node of plant {plant!r} published its health within {timeout_s:g} s")
+    return 0 if found and all(found.values()) else 1
 
 
 def _subscribe(bus: ZenohBus, plant: str, process: "Process | None") -> StatusBoard:

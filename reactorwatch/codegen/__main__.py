@@ -1,11 +1,12 @@
 """Compile all numerical kernels once: `python -m reactorwatch.codegen`."""
 
-from reactorwatch.cli.kernels import compile_kernels
 from reactorwatch.cli.main import run_command
-from reactorwatch.runtime.logs import configure
 
 
 def _run() -> int:
+    from reactorwatch.cli.kernels import compile_kernels  # imports NumPy, which `run_command` prepares
+    from reactorwatch.runtime.logs import configure
+
     configure()
     compile_kernels()
     return 0

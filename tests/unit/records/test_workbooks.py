@@ -9,7 +9,6 @@ from pathlib import Path
 
 import openpyxl
 import pytest
-from openpyxl.formatting.rule import ColorScaleRule
 from typer.testing import CliRunner
 
 import reactorwatch as rw
@@ -180,7 +179,9 @@ def test_rules_and_widths_of_columns_are_no_cells(tmp_path: Path, monkeypatch: p
     for row in SHEETS["Data"]:
         book.active.append(row)
     for k in range(1, 800):
-        scale = ColorScaleRule(start_type="min", start_color="FF0000", end_type="max", end_color="00FF00")
+        scale = openpyxl.formatting.rule.ColorScaleRule(
+            start_type="min", start_color="FF0000", end_type="max", end_color="00FF00"
+        )
         book.active.conditional_formatting.add(f"B{k}", scale)
     path = tmp_path / "book.xlsx"
     book.save(path)
