@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from reactorwatch.contract import keys
-from reactorwatch.contract.codec import Encoded, encode_message
-from reactorwatch.contract.messages_pb2 import CommandReply, InjectFault, SetInput
+from reactorwatch.contract.codec import Encoded, Publication, encode, encode_message
+from reactorwatch.contract.messages_pb2 import CommandReply, Health, InjectFault, SetInput
 from reactorwatch.runtime.bus_zenoh import ZenohBus, connect
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.event_loop import StopSignal
@@ -213,10 +213,15 @@ def test_the_plant_obeys_commands_on_the_bus(bus: ZenohBus, endpoint: str, start
 
 def test_a_node_that_is_not_there_is_not_alive(bus: ZenohBus, endpoint: str, called: Command) -> None:
     nothing = called("status", "--check", "--endpoint", endpoint, "--timeout", "1")
-    assert (nothing.returncode, nothing.stdout.count("not there")) == (1, 3)
+    assert (nothing.returncode, nothing.stdout) == (1, "no node of plant 'cstr' published its health within 1 s\n")
+    health = Health(time_ns=1, node="monitor", phase="watching")
+    bus.publish(encode(Publication(keys.key("cstr", keys.HEALTH, "monitor"), health)))
+    dead = called("status", "--check", "--endpoint", endpoint, "--timeout", "1")
+    assert (dead.returncode, dead.stdout) == (1, "monitor is not there within 1 s\n")
     bus.declare_token(keys.key("cstr", keys.ALIVE, "monitor"))
     there = called("status", "--check", "monitor", "--endpoint", endpoint)
-    assert (there.returncode, there.stdout) == (0, "monitor is alive\n")
+    all_there = called("status", "--check", "--endpoint", endpoint)
+    assert [(item.returncode, item.stdout) for item in (there, all_there)] == 2 * [(0, "monitor is alive\n")]
     bus.undeclare_token(keys.key("cstr", keys.ALIVE, "monitor"))
     gone = called("status", "--check", "monitor", "--endpoint", endpoint, "--timeout", "1", "--json")
     assert gone.returncode == 1

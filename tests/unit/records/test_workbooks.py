@@ -6,6 +6,7 @@ import zipfile
 from collections.abc import Sequence
 from datetime import date, datetime, time, timedelta
 from pathlib import Path
+from typing import Any
 
 import openpyxl
 import pytest
@@ -48,7 +49,7 @@ def test_a_workbook_reads_like_its_text(tmp_path: Path) -> None:
         [time.replace(tzinfo=None), *(None if hole else value for value, hole in zip(row, holes, strict=True))]
         for time, row, holes in zip(clock(), VALUES.tolist(), HOLES.tolist(), strict=True)
     ]
-    rows = [["Anlage 7"], ["Zeit", "qc [l/min]", "C [mol/l]", "T [K]"], *values]
+    rows: list[list[object]] = [["Anlage 7"], ["Zeit", "qc [l/min]", "C [mol/l]", "T [K]"], *values]
     record = read_table(write(tmp_path / "book.xlsx", {"empty": [], "Daten": rows}))
     assert record.zero == f"{START:%Y-%m-%dT%H:%M:%SZ}"
     assert record.units == UNITS
@@ -175,13 +176,12 @@ def test_a_workbook_that_memory_could_not_hold_is_refused(
 
 def test_rules_and_widths_of_columns_are_no_cells(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(decode, "LARGEST_TEXT", 1_000_000)
-    book = openpyxl.Workbook()
+    rules: Any = openpyxl.formatting.rule
+    book: Any = openpyxl.Workbook()
     for row in SHEETS["Data"]:
         book.active.append(row)
     for k in range(1, 800):
-        scale = openpyxl.formatting.rule.ColorScaleRule(
-            start_type="min", start_color="FF0000", end_type="max", end_color="00FF00"
-        )
+        scale = rules.ColorScaleRule(start_type="min", start_color="FF0000", end_type="max", end_color="00FF00")
         book.active.conditional_formatting.add(f"B{k}", scale)
     path = tmp_path / "book.xlsx"
     book.save(path)
