@@ -3,7 +3,7 @@
 import io
 import sys
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from datetime import date, datetime, time, timedelta
 from pathlib import Path
 from typing import Any
@@ -24,12 +24,12 @@ from reactorwatch.records.write import write_table
 from tests.unit.records.variants import HOLES, START, UNITS, VALUES, clock
 
 Sheets = dict[str, Sequence[Sequence[object]]]
-ROWS = [[k, 10.0 + k] for k in range(30)]
+ROWS: list[list[object]] = [[k, 10.0 + k] for k in range(30)]
 SHEETS: Sheets = {
     "Cover": [["Report of rig 7"], ["made", "by hand"], ["number", 3]],
     "empty": [],
     "Data": [["time_s", "T"], *ROWS],
-    "Backup": [["time_s", "T"], *([k, -value] for k, value in ROWS)],
+    "Backup": [["time_s", "T"], *([k, -10.0 - k] for k in range(30))],
 }
 
 
@@ -152,7 +152,7 @@ def _replaced(sheet: bytes) -> bytes:
     return file.getvalue()
 
 
-BOMBS = {
+BOMBS: dict[str, Callable[[], bytes]] = {
     "a cell far from the others": _far_cell,
     "cells without references": lambda: _replaced(
         b"<worksheet><sheetData><row r='1'>%s</row><row r=\"1048576\"><c><v>1</v></c></row></sheetData></worksheet>"
