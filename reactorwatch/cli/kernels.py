@@ -55,9 +55,14 @@ def compile_kernels() -> None:
         _mark().touch()
 
 
+def is_first_start() -> bool:
+    """True if this installation never compiled its kernels for this user."""
+    return not _mark().exists()
+
+
 def compile_at_first_start() -> None:
-    """Compile the kernels if this installation never did so for this user; not where no mark of it can be left."""
-    if _mark().exists():
+    """Compile the kernels at the first start; not where no mark of it can be left."""
+    if not is_first_start():
         return
     try:
         _mark().parent.mkdir(parents=True, exist_ok=True)

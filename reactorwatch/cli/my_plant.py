@@ -138,8 +138,9 @@ def monitor(
     from monitor_node.__main__ import run
     from monitor_node.config import MonitorConfig
     from monitor_node.fleet.config import FleetConfig
+    from monitor_node.watched_process import load_process
     from reactorwatch.cli.bus_client import metrics_settings, node_settings
-    from reactorwatch.cli.kernels import compile_at_first_start
+    from reactorwatch.cli.kernels import compile_at_first_start, is_first_start
     from reactorwatch.cli.up import diagnosis_settings, run_diagnosis_node
     from reactorwatch.records.write import check_folder_name
     from reactorwatch.runtime.config import LogConfig, section
@@ -164,6 +165,8 @@ def monitor(
         raise InputError("--shard is a part of the plants that --plants names; give both")
     if state is not None:
         check_folder_name(state, "--state")
+    if is_first_start() and fleet.plants is None:
+        load_process(config_of_monitor)  # its errors are not half a minute late
     compile_at_first_start()
     if fleet.plants is not None:
         run(config_of_monitor, bus, metrics_settings(tables), fleet)
