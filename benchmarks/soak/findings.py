@@ -75,7 +75,7 @@ def most_in_thirds(taken: Sequence[Taken], rows: int) -> tuple[float, float, flo
 
 
 def find_growth_mb(taken: Sequence[Taken], rows: int) -> float | None:
-    """How much a process has grown since the warm-up, in MB; None if it did not run all the time since."""
+    """Growth of a process since the warm-up, in MB; None if it did not run all the time since."""
     _, middle, last = _thirds(taken, rows)
     if not middle or not last or len({item.pid for item in (*middle, *last)}) > 1:
         return None
