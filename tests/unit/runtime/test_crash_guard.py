@@ -43,6 +43,7 @@ def test_the_modules_are_those_that_the_documents_name() -> None:
         "monitor_node",
         "plant_node",
         "reactorwatch",
+        "reactorwatch.codegen",
         "recorder",
         "recorder.tools.replay",
     ]
@@ -59,6 +60,7 @@ def test_an_error_within_a_node_process_is_one_line(
         raise raised
 
     monkeypatch.setattr("reactorwatch.runtime.bus_zenoh.connect", fail)
+    monkeypatch.setattr("reactorwatch.cli.kernels.compile_kernels", fail)
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     monkeypatch.chdir(tmp_path)
     Path("settings.toml").write_text('[diagnosis]\nout = "reports"\n[replay]\nfile = "run.csv"\n')
