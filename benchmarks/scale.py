@@ -184,7 +184,7 @@ def without_bus(plants: int) -> float:
 
 
 def _check_known(arrived: int, known: int) -> None:
-    """End this process, whose threads still serve, if not even the first rows of each plant, which are not timed, came."""
+    """End this process, whose threads still serve, if not even the first rows, which are not timed, all came."""
     if arrived <= known:
         print(f"{arrived} messages arrived, and the router lost some of the first {known}", file=sys.stderr, flush=True)
         os._exit(1)
