@@ -241,7 +241,8 @@ def register(*function, **options):
 numba.njit = register
 from monitor_node.config import MonitorConfig
 from monitor_node.causes.stage import preparation
-from reactorwatch.cli import kernels
+from reactorwatch.runtime import logs
+from reactorwatch.cli import kernels as compilation
 from reactorwatch.process.library.cstr import cstr
 from reactorwatch.codegen.cache import CodeCache
 
@@ -250,8 +251,9 @@ CodeCache._store = lambda self, path, code: made.append(path.name)
 parts = sum(1 for _ in preparation(MonitorConfig(), cstr()))
 CodeCache._store = keep
 print(parts, len(made))
-kernels.FAULT = "feed_temperature:step:3@40min"
-kernels.compile_kernels()
+logs.configure()  # on standard error
+compilation.FAULT = "feed_temperature:step:3@40min"
+compilation.compile_kernels()
 print(sum(sum(kernel.stats.cache_hits.values()) for kernel in kernels))
 print([kernel.__name__ for kernel in kernels if kernel.stats.cache_misses])
 """
