@@ -12,7 +12,7 @@ from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, decode, encode_message
 from reactorwatch.contract.messages_pb2 import CommandReply
 from reactorwatch.errors import InputError
-from reactorwatch.runtime.bus_zenoh import connect
+from reactorwatch.runtime.bus_zenoh import ZenohBus, connect
 from reactorwatch.runtime.config import BusConfig, LogConfig, MetricsConfig, read_settings, section
 from reactorwatch.runtime.event_loop import StopSignal
 from reactorwatch.runtime.logs import configure
@@ -42,6 +42,17 @@ def observed_process(process: str | None, recorder: RecorderConfig) -> "Process 
     return PlantProcesses(recorder.processes).find(recorder.plant) if process is None else find_process(process)
 
 
+def connect_within(config: BusConfig, name: str, timeout_s: float) -> ZenohBus | None:
+    """Connect to the bus under a name; None if no router is there within the time."""
+    stop = StopSignal()
+    timer = threading.Timer(timeout_s, stop.set)
+    timer.start()
+    try:
+        return connect(config, name, stop)
+    finally:
+        timer.cancel()
+
+
 class NoReplyError(InputError):
     """No such node replied."""
 
@@ -58,13 +69,7 @@ def send_command(node: str, client: ClientOptions, name: str, message: Message) 
         plant = keys.check_plant(client.name or str(tables.get(node, {}).get("plant") or keys.DEFAULT_PLANT))
     except ValueError as error:
         raise InputError(str(error)) from error
-    stop = StopSignal()
-    timer = threading.Timer(timeout_s, stop.set)
-    timer.start()
-    try:
-        bus = connect(bus_config, "command", stop)
-    finally:
-        timer.cancel()
+    bus = connect_within(bus_config, "command", timeout_s)
     if bus is None:
         raise InputError(f"no router at {bus_config.endpoint} within {timeout_s:g} s; is it running?")
     asked_s = time.monotonic()

@@ -5,9 +5,11 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Sequence
+from functools import partial
 from math import inf, isnan
 from typing import TYPE_CHECKING, Any
 
+from reactorwatch.cli.bus_client import connect_within
 from reactorwatch.cli.display import Screen, json_line, print_lines, print_screen_text, screen
 from reactorwatch.cli.status_view import ANNUNCIATED, SECOND_NS, Now, age_s, format_plant, sort_alarms
 from reactorwatch.contract import keys
@@ -25,7 +27,7 @@ from reactorwatch.contract.messages_pb2 import (
 )
 from reactorwatch.contract.promise_text import promise_fields
 from reactorwatch.errors import InputError
-from reactorwatch.runtime.bus_zenoh import ZenohBus, connect, connect_now
+from reactorwatch.runtime.bus_zenoh import ZenohBus, connect_now
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.event_loop import StopSignal, stop_on_signals
 from reactorwatch.terminal import printable
@@ -232,37 +234,27 @@ def check_alive(config: BusConfig, plant: str, nodes: Sequence[str], timeout_s: 
     """
     alive: set[str] = set()
     healthy: set[str] = set()
-    changed, stop = threading.Condition(), StopSignal()
+    changed = threading.Condition()
     until_s = time.monotonic() + timeout_s
 
     def are_alive() -> bool:
-        return alive.issuperset(nodes or healthy) and bool(nodes or healthy)
+        wanted = set(nodes) or healthy
+        return bool(wanted) and wanted <= alive
 
-    def on_health(message: Encoded) -> None:
-        topic = keys.parse(message.key)
-        if topic is not None:
-            with changed:
-                healthy.add(topic.name)
-                changed.notify_all()
-
-    def on_token(key: str, is_alive: bool) -> None:
+    def update(names: set[str], key: str, is_there: bool) -> None:
         topic = keys.parse(key)
         if topic is not None:
             with changed:
-                (alive.add if is_alive else alive.discard)(topic.name)
+                (names.add if is_there else names.discard)(topic.name)
                 changed.notify_all()
 
-    timer = threading.Timer(timeout_s, stop.set)
-    timer.start()
-    try:
-        bus = connect(config, "status", stop)
-    finally:
-        timer.cancel()
+    bus = connect_within(config, "status", timeout_s)
     if bus is not None:
         try:
-            bus.subscribe_liveliness(keys.all_keys(plant, keys.ALIVE), on_token)
+            bus.subscribe_liveliness(keys.all_keys(plant, keys.ALIVE), partial(update, alive))
             if not nodes:
-                bus.subscribe(keys.all_keys(plant, keys.HEALTH), on_health, history_s=HISTORY_S)
+                health = keys.all_keys(plant, keys.HEALTH)
+                bus.subscribe(health, lambda message: update(healthy, message.key, True), history_s=HISTORY_S)
             with changed:
                 changed.wait_for(are_alive, max(until_s - time.monotonic(), 0.0))
         finally:

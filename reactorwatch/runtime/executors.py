@@ -206,7 +206,6 @@ def choose_executor(processes: int | None = None, scheduler: str | None = None) 
         from reactorwatch.runtime.dask_workers import DaskExecutor
 
         return DaskExecutor(scheduler)
-
     if processes is None:
         processes = available_cores()
     if processes < 1:

@@ -127,7 +127,7 @@ def test_twins_are_the_causes_that_imitate_each_other_but_for_a_hundredth() -> N
 
 
 def _signature(cause: str) -> Array:
-    """What a tenth of the small step does to both measurements, over their noise, in two runs."""
+    """Response of both measurements to a tenth of the small step, over their noise, in two runs."""
     fault = next(item for item in BANK if item.cause == cause and item.profile == "step")
     effect = next(item for item in CAUSES if item.name == cause)
     simulator = Simulator(effect.extend(cstr(), STEP))

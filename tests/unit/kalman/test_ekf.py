@@ -151,7 +151,7 @@ def test_with_the_true_fault_in_the_model_the_innovations_of_a_faulty_plant_are_
 
 @pytest.mark.parametrize("onset", ["2min", "2.013min", "2.05min", "2.099min"])
 def test_without_noise_it_predicts_what_the_simulator_runs(onset: str) -> None:
-    """Whether anything is measured or not; the onset of a fault lies on a row, or anywhere between two."""
+    """With measurements and without; the onset of a fault lies on a row, or anywhere between two."""
     model = parse_fault(f"coolant_flow:step:-0.05@{onset}").extend(cstr())
     time_min = np.append(np.arange(40) * 0.1, [4.3, 9.0])
     inputs = np.where(np.arange(42) % 20 < 10, 95.0, 103.0)

@@ -92,7 +92,7 @@ def test_it_begins_where_outputs_far_from_there_are_no_numbers() -> None:
 
 @pytest.mark.parametrize("seed", range(5))
 def test_a_valve_that_sticks_is_taken_to_begin_near_what_is_asked_of_it(seed: int) -> None:
-    """What noise moves it by in the first minute is less than half of what it sticks by, so that it opens in time."""
+    """Noise moves it by less than half of its stiction in the first minute, so that it opens in time."""
     fault = parse_fault("valve_stiction:constant:6.0")
     time_min, flow, measured = record_of(10, seed=seed, faults=("valve_stiction:constant:6.0",))
     sensors = NoiseLevels(SENSORS.measurement_sd, (0.0, 0.0, 0.0))

@@ -125,7 +125,7 @@ def test_the_limit_without_memory_is_hotelling_s(dimension: int, freedom: float)
 
 
 def alarms(statistic: Array, limit: float, usual: float) -> float:
-    """How many: a further one only after the statistic has been back at its usual value."""
+    """Count of alarms; the next one comes only after the statistic has been back at its usual value."""
     events = np.where(statistic > limit, 1, np.where(statistic <= usual, -1, 0))
     return float(np.sum(np.diff(events[events != 0], prepend=-1) == 2))
 
@@ -185,7 +185,7 @@ FORGETTING, TRAINING = 0.98, 500
 
 
 class Run(NamedTuple):
-    """Of y[k] = 0.8 y[k-1] + 0.5 u[k-1] + v[k]: the rows of its regression, shape (rows, 3) and (rows,)."""
+    """Rows of the regression of y[k] = 0.8 y[k-1] + 0.5 u[k-1] + v[k], shape (rows, 3) and (rows,)."""
 
     regressors: Array
     outputs: Array
@@ -228,7 +228,7 @@ def textbook(seen: Run, reference: Array, differences: Array) -> Array:
 
 
 def false_alarms(correlation: float, *, sandwich: bool) -> tuple[float, float]:
-    """Of 150 plants over 4,000 rows each: their number over the one promised, 1 in 1,000, and its standard error."""
+    """Alarms of 150 plants over 4,000 rows each, over the promised 1 in 1,000, and their standard error."""
     rng, plants, rows, arl0 = np.random.default_rng(1), 150, 4000, 1000.0
     counts = []
     for _ in range(plants):
