@@ -40,8 +40,7 @@ import msgspec
 import numpy as np
 
 from reactorwatch.arrays import Array
-from reactorwatch.codegen.array_function import ArrayFunction
-from reactorwatch.codegen.compiled_function import CompiledFunction
+from reactorwatch.codegen.compiled_function import ArrayFunction, CompiledFunction
 from reactorwatch.kalman.batch import (
     LONGEST_GAP_MIN,
     LONGEST_ROW_MIN,

@@ -31,7 +31,7 @@ import casadi as ca
 import numpy as np
 
 from reactorwatch.arrays import Array
-from reactorwatch.codegen.array_function import ArrayFunction
+from reactorwatch.codegen.compiled_function import ArrayFunction
 from reactorwatch.kalman.ekf_step import output_function
 from reactorwatch.process import effects_of, named_effects
 from reactorwatch.process.effect import TIMING, Effect

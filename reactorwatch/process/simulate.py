@@ -22,8 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reactorwatch.arrays import Array
-from reactorwatch.codegen.array_function import ArrayFunction
-from reactorwatch.codegen.compiled_function import CompiledFunction
+from reactorwatch.codegen.compiled_function import ArrayFunction, CompiledFunction
 from reactorwatch.process.model import MODEL_CACHE_SIZE, ProcessModel
 
 LONGEST_STEP_MIN = 0.05

@@ -19,9 +19,9 @@ from functools import cache
 import casadi as ca
 
 from reactorwatch.process.effect import Effect, EffectConstant, ParameterEffect
+from reactorwatch.process.law import INPUT, SENSOR, SOURCE
 from reactorwatch.process.model import Output, Place, ProcessModel, new_clock, parameter, variable
 from reactorwatch.process.operation import Example, InputLevels, Operation
-from reactorwatch.process.places import INPUT, SENSOR, SOURCE
 from reactorwatch.process.signal_effects import OutputBias
 
 SMALL_LEVEL_V = 0.01

@@ -19,8 +19,8 @@ from functools import cache
 import casadi as ca
 
 from reactorwatch.process.effect import TIMING, Effect, EffectConstant, ParameterEffect, ParameterShift
+from reactorwatch.process.law import CAPACITY, FACTOR, INPUT, SENSOR, SOURCE
 from reactorwatch.process.model import Output, Place, ProcessModel, new_clock, parameter, variable
-from reactorwatch.process.places import CAPACITY, FACTOR, INPUT, SENSOR, SOURCE
 from reactorwatch.process.signal_effects import (
     InputGain,
     InputLag,

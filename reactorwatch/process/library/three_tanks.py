@@ -21,9 +21,9 @@ from typing import ClassVar
 import casadi as ca
 
 from reactorwatch.process.effect import Effect, ParameterEffect
+from reactorwatch.process.law import FACTOR, SENSOR, SOURCE
 from reactorwatch.process.model import Output, Place, ProcessModel, new_clock, parameter, variable
 from reactorwatch.process.operation import Controller, Example, InputLevels, Operation
-from reactorwatch.process.places import FACTOR, SENSOR, SOURCE
 from reactorwatch.process.signal_effects import InputOffset, OutputBias
 
 SMALL_LEVEL_CM = 0.01

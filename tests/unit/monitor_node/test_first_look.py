@@ -17,8 +17,7 @@ from monitor_node.fleet.config import FleetConfig
 from monitor_node.node import MonitorNode
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
-from reactorwatch.codegen.array_function import ArrayFunction
-from reactorwatch.codegen.compiled_function import CompiledFunction
+from reactorwatch.codegen.compiled_function import ArrayFunction, CompiledFunction
 from reactorwatch.kalman import error_dynamics
 from reactorwatch.kalman.batch import STEPS_PER_SEARCH
 from reactorwatch.kalman.ekf_step import compiled_row, predict_function, row_function

@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.numba_kernel import Entry, jit
-from reactorwatch.identification.black_box.model import BlackBoxModel, predict_outputs
+from reactorwatch.identification.black_box_model import BlackBoxModel, predict_outputs
 from reactorwatch.stored_state import Memory
 
 UNSEEN = 1.3  # times the standard deviation of the training's innovations: more is an extrapolation

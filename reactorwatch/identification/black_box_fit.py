@@ -18,11 +18,13 @@ from numpy.typing import NDArray
 
 from reactorwatch.arrays import Array
 from reactorwatch.errors import InputError
-from reactorwatch.identification.black_box.model import BlackBoxModel, Shape, lagged_inputs
-from reactorwatch.identification.black_box.prediction_error import (
+from reactorwatch.identification.black_box_model import (
     NEXT,
     START,
+    BlackBoxModel,
     RowArrays,
+    Shape,
+    lagged_inputs,
     log_likelihood,
     prediction_errors,
 )
@@ -43,7 +45,7 @@ class Rows:
     Attributes:
         y: outputs, shape (rows, outputs); NaN where missing.
         u: lagged inputs, shape (rows, inputs lags).
-        kinds: kinds of the rows, see `prediction_error`.
+        kinds: kinds of the rows, see `START`.
         smallest: smallest variance of each output's measurements.
     """
 
