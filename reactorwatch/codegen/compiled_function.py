@@ -37,7 +37,7 @@ from reactorwatch.arrays import Array
 from reactorwatch.codegen.llvm_ir import CHAINED, IR_VERSION, PER_ROW, SHARED, RowLoop, check, write_ir
 
 LANES = 4
-"""Number of rows, or chains of rows, in one vector operation."""
+"""Number of rows, or chains of rows, in one vector operation: four doubles are the 256 bits of AVX2."""
 
 _Call: TypeAlias = Callable[..., int]
 
@@ -253,9 +253,6 @@ class ArrayFunction:
         return [item.copy() for item in self.results]
 
 
-CAPACITY, EVICTED = 4000, 1000
-"""Number of entries, of some 30 kB each, and how many of the oldest are evicted when there are more."""
-
 _DIGEST_BYTES = hashlib.sha256().digest_size
 
 
@@ -264,11 +261,11 @@ class CodeCache:
 
     Args:
         folder: folder of the entries; made with the first one.
-        capacity: largest number of entries.
+        capacity: largest number of entries, of some 30 kB each.
         evicted: number of the oldest entries that are evicted when there are more.
     """
 
-    def __init__(self, folder: Path, capacity: int = CAPACITY, evicted: int = EVICTED) -> None:
+    def __init__(self, folder: Path, capacity: int = 4000, evicted: int = 1000) -> None:
         self._folder, self._capacity, self._evicted = folder, capacity, evicted
 
     def get_or_make(self, name: str, make: Callable[[], bytes]) -> bytes:

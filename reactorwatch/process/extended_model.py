@@ -44,7 +44,6 @@ from reactorwatch.process.profiles import FREE_NAME, PROFILES, Profile, free_pro
 
 FORMAT = "reactorwatch.model.v1"
 
-_MINUTE_NS = 60_000_000_000
 _SIZE = re.compile(r"(.+?)(?:_\d+)?\.size")
 
 
@@ -109,7 +108,7 @@ class ExtendedModel:
         """Copy with minutes counted from another time; unchanged where its own zero is unknown."""
         if not self.zero_ns:
             return self
-        by_min = (self.zero_ns - zero_ns) / _MINUTE_NS
+        by_min = (self.zero_ns - zero_ns) / 60_000_000_000
         equations = None if self.equations is None else _shift(self.equations, by_min)
         effects = tuple(item.shift(by_min) for item in self.effects)
         return replace(self, effects=effects, zero_ns=zero_ns, equations=equations)

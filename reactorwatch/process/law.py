@@ -127,9 +127,6 @@ APART = "h"
 LAG = "lag"
 """Parameter of a law that lags behind its variables (`Place.lag_min`): its time constant."""
 
-MARGIN = 0.05
-"""Fraction of a variable's range by which it may leave the range before `outside` says so."""
-
 
 class FormParameter(NamedTuple):
     """A parameter of a form; `of` is the index of the variable whose unit it has."""
@@ -362,7 +359,7 @@ class ExtendedLaw(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         for name, (low, high) in self.range.items():
             if name in values and values[name].size:
                 least, most = float(np.nanmin(values[name])), float(np.nanmax(values[name]))
-                margin = MARGIN * (high - low)
+                margin = 0.05 * (high - low)  # a twentieth of the range is no departure
                 if least < low - margin or most > high + margin:
                     sentences.append(
                         f"{name} goes from {least:.4g} to {most:.4g}; the law was seen from {low:.4g} to {high:.4g} "

@@ -26,10 +26,7 @@ from reactorwatch.errors import InputError
 from reactorwatch.process.model import MODEL_CACHE_SIZE, ProcessModel
 from reactorwatch.process.simulate import Simulator, rest_function
 
-STARTS = 1024
-ITERATIONS = 80
-RESIDUAL = 1e-10  # scales per minute
-SAME = 1e-6  # scales
+STARTS = 1024  # of the lattice: some 30 a side in two dimensions, 10 in three
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,7 +118,7 @@ class SteadyStates:
         fixed = (inputs, p, np.array([time_min]))
         x = self._starts.copy()
         searching = np.arange(len(x))
-        for _ in range(ITERATIONS):
+        for _ in range(80):  # what still moves then does not converge
             after = self._search.map(x[searching], *fixed)[0][:, :, 0]
             moved = np.any(after != x[searching], axis=1)
             x[searching] = after
@@ -129,11 +126,11 @@ class SteadyStates:
             if not searching.size:
                 break
         rate = self._search.map(x, *fixed)[1][:, :, 0]
-        roots = x[np.max(np.abs(rate) / self._scales, axis=1) < RESIDUAL]
+        roots = x[np.max(np.abs(rate) / self._scales, axis=1) < 1e-10]  # scales a minute
         distinct = []
         while len(roots):
             distinct.append(roots[0])
-            roots = roots[np.max(np.abs(roots - roots[0]) / self._scales, axis=1) > SAME]
+            roots = roots[np.max(np.abs(roots - roots[0]) / self._scales, axis=1) > 1e-6]  # scales
         return distinct
 
 
