@@ -19,7 +19,7 @@ from reactorwatch.cli.main import main
 from reactorwatch.cli.status import StatusBoard, _text
 from reactorwatch.contract.codec import Encoded, Publication, encode
 from reactorwatch.contract.messages_pb2 import ALARM_STATE_UNACKNOWLEDGED, QUALITY_GOOD, Alarm, Sample
-from reactorwatch.runtime import logs
+from reactorwatch.runtime.node_main import configure_log
 from reactorwatch.terminal import printable, printable_lines
 from recorder import RecordedMessage
 from recorder.files.writer import RecordingWriter
@@ -131,7 +131,7 @@ def test_alarms_and_status_from_the_bus_are_shown_and_not_sent(capsys: pytest.Ca
 
 
 def test_logs_for_people_are_lines_of_text(capsys: pytest.CaptureFixture[str]) -> None:
-    logs.configure()
+    configure_log()
     structlog.get_logger().warning(HOSTILE, key=HOSTILE, path=Path(HOSTILE), **{HOSTILE: 1})
     shown = capsys.readouterr().err
     assert acted_on(shown) == []
