@@ -9,7 +9,7 @@ import msgspec
 
 from reactorwatch.contract.keys import DEFAULT_PLANT, check_plant
 from reactorwatch.description.find import find_process
-from reactorwatch.runtime.setting_rules import check_bounds
+from reactorwatch.runtime.config import check_bounds
 from reactorwatch.spc.charts.base import Setting, SignalSetting
 from reactorwatch.spc.charts.catalogue import CHARTS, chart
 from reactorwatch.spc.charts.value_chart import ValueChart
