@@ -16,7 +16,7 @@ from reactorwatch.api.page import write_page
 from reactorwatch.api.record_view import signal_panels, time_title
 from reactorwatch.api.records import ProcessLike
 from reactorwatch.contract.codec import encode
-from reactorwatch.description.find import find_process
+from reactorwatch.description.read import find_process
 from reactorwatch.notebook import html
 from reactorwatch.notebook.figures import ALARM, Mark, draw_panels
 from reactorwatch.notebook.frames import frame_of_rows

@@ -9,7 +9,7 @@ import msgspec
 
 from reactorwatch.api.page import write_page
 from reactorwatch.api.records import ProcessLike, process_of
-from reactorwatch.description.find import find_process
+from reactorwatch.description.read import find_process
 from reactorwatch.errors import InputError, describe_unknown
 from reactorwatch.identification.data import Dataset
 from reactorwatch.identification.identify import HeldOutRun, Identification, ModelForm, identify_and_run

@@ -13,9 +13,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from reactorwatch.cli.info import info_object, info_text
-from reactorwatch.description.find import ProcessChoice, find_process
 from reactorwatch.description.process import ROLES, Process, Signal
-from reactorwatch.description.read import read_process_table
+from reactorwatch.description.read import ProcessChoice, find_process, read_process_table
 from reactorwatch.errors import InputError
 from reactorwatch.records.record import Record, join_runs
 from reactorwatch.records.write import write_table

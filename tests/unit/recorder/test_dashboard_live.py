@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from rerun.chunk import RrdReader
 
 from reactorwatch.contract.codec import Encoded
-from reactorwatch.description.find import find_process
+from reactorwatch.description.read import find_process
 from recorder.columns import RunColumns, read_run
 from recorder.view.drawing import SAMPLE_TIME, Renderer
 from recorder.view.live import DRAW_INTERVAL_NS, LiveDashboard

@@ -10,8 +10,8 @@ from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from reactorwatch.cli.diagnose import DiagnosisOptions, load_case
 from reactorwatch.contract.codec import encode
-from reactorwatch.description.find import PlantProcesses, find_process
 from reactorwatch.description.process import Process
+from reactorwatch.description.read import PlantProcesses, find_process
 from reactorwatch.errors import InputError
 from reactorwatch.process import MODELS
 from reactorwatch.process.fault import parse_fault

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from reactorwatch.description.find import find_process
+from reactorwatch.description.read import find_process
 from reactorwatch.errors import InputError
 from recorder import RecordedMessage
 from recorder.files.index import FOOTER, RECORD, TABLE_CURE

@@ -13,7 +13,7 @@ from mcap_protobuf.decoder import DecoderFactory
 from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Publication, decode, encode, encoding_of
-from reactorwatch.description.find import find_process
+from reactorwatch.description.read import find_process
 from reactorwatch.errors import InputError
 from reactorwatch.version import build_metadata
 from recorder import RecordedMessage

@@ -11,8 +11,8 @@ import pytest
 import recorder.panels
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Publication, encode
-from reactorwatch.description.find import find_process
 from reactorwatch.description.process import Process, Signal
+from reactorwatch.description.read import find_process
 from recorder.columns import (
     ADAPTIVE,
     EQUATIONS,
