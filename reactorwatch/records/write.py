@@ -317,7 +317,6 @@ TIME_COLUMN, RUN_COLUMN, CLOCK_COLUMN = "time_min", "run", "time"
 """Columns beside the signals: minutes, the run of each row if there are several, and clock time if it is asked for."""
 
 WRITTEN_SUFFIXES = (".csv", ".gz", ".xlsx", ".parquet")
-MAX_SHEET_ROWS = 1_048_576  # of Excel since 2007
 
 
 def write_table(path: Path, record: "Record", *, clock: bool = False) -> None:
@@ -388,10 +387,8 @@ def _write_text(path: Path, record: "Record", clock: bool, *, compress: bool = F
 
 
 def _write_workbook(path: Path, record: "Record", clock: bool) -> None:
-    if record.rows >= MAX_SHEET_ROWS:
-        raise InputError(
-            f"{path}: a sheet has at most {MAX_SHEET_ROWS} rows, got {record.rows}; write .parquet or .csv"
-        )
+    if record.rows >= 1_048_576:  # of Excel since 2007
+        raise InputError(f"{path}: a sheet has at most 1048576 rows, got {record.rows}; write .parquet or .csv")
     try:
         import openpyxl
     except ImportError as error:
