@@ -12,9 +12,14 @@ from numpy.typing import NDArray
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.compiled_function import LANES
 from reactorwatch.codegen.numba_kernel import jit
-from reactorwatch.diagnosis.fitting.augmented_model import AugmentedModel, augment_model
+from reactorwatch.diagnosis.fitting.augmented_model import (
+    AugmentedModel,
+    ShiftedRun,
+    augment_model,
+    restore_rows,
+    shift_measurements,
+)
 from reactorwatch.diagnosis.fitting.colored_noise import Noise, add_colored_noise, estimate_noise
-from reactorwatch.diagnosis.fitting.measurement_delay import ShiftedRun, restore_rows, shift_measurements
 from reactorwatch.diagnosis.fitting.profiles import Signal
 from reactorwatch.diagnosis.run import Run, input_uncertainty_of
 from reactorwatch.kalman.batch import (

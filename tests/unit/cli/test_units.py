@@ -20,7 +20,7 @@ from reactorwatch.cli.backtest import choose_settings
 from reactorwatch.cli.batch import Job
 from reactorwatch.cli.main import app
 from reactorwatch.description.find import DEFAULT_CHOICE, ProcessChoice
-from reactorwatch.diagnosis.units import find_wrong_unit
+from reactorwatch.diagnosis.record_checks import find_wrong_unit
 from reactorwatch.errors import InputError
 from reactorwatch.identification.identify import ModelForm
 from reactorwatch.process import MODELS
