@@ -156,8 +156,7 @@ def open_messages(
         encoded = (encode(item) for item in publications)
         zero_ns, has_clock_time = measured.stored_zero_ns, bool(measured.zero_ns)
         return MessageSource(encoded, zero_ns, has_clock_time, measured.read_as, choice.load(), measured)
-    from recorder.files.metadata import ZERO_NS
-    from recorder.files.recording import Recording, has_clock, zero_from
+    from recorder.files.recording import ZERO_NS, Recording, has_clock, zero_from
 
     recording = Recording(path)
     read, metadata = (Encoded(*entry[:4]) for entry in recording.messages(plant=plant)), recording.metadata
@@ -175,8 +174,7 @@ def expand_folder(folder: Path) -> list[Path]:
     Raises:
         InputError: the folder holds neither.
     """
-    from recorder.files.metadata import FILE_INDEX
-    from recorder.files.recording import Recording, live_file
+    from recorder.files.recording import FILE_INDEX, Recording, live_file
 
     one_recording = {FILE_INDEX, "cut", "merged"}
     records, recordings = (list_files(folder, suffix) for suffix in (".csv", ".mcap"))
