@@ -14,8 +14,8 @@ bus. Publishers number their messages (`reactorwatch.runtime.reorder_buffer`), s
 messages is known.
 
 Equations of the catalogue are stored by name, with the constants that differ and the deviations that the model holds,
-and other ones as data (`stored_equations`). Effects of a user's code are neither: a recording of a process that has
-some is read with the process named by an option.
+and other ones as data (`process.extended_model`). Effects of a user's code are neither: a recording of a process that
+has some is read with the process named by an option.
 """
 
 import heapq

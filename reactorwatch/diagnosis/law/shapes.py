@@ -24,9 +24,8 @@ import numpy as np
 from reactorwatch.arrays import Array
 from reactorwatch.diagnosis.run import Run
 from reactorwatch.process.effect import Effect, ParameterShift
-from reactorwatch.process.law import add_lag_states
+from reactorwatch.process.law import CAPACITY, FACTOR, SENSOR, add_lag_states, correct, find_place, variable_expression
 from reactorwatch.process.model import MODEL_CACHE_SIZE, Parameter, Place, ProcessModel
-from reactorwatch.process.places import CAPACITY, FACTOR, SENSOR, correct, find_place, variable_expression
 
 
 @dataclass(frozen=True)

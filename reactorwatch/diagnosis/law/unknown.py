@@ -40,9 +40,8 @@ from reactorwatch.diagnosis.search.search import FittedHypothesis, SearchResult
 from reactorwatch.diagnosis.unknown_input.localise import UnknownInput, locate
 from reactorwatch.diagnosis.whiteness import DOUBTFUL, WHITE, minus_log10_p
 from reactorwatch.process.effect import Effect
-from reactorwatch.process.law import ExtendedLaw
+from reactorwatch.process.law import ExtendedLaw, places_of
 from reactorwatch.process.model import Place, ProcessModel
-from reactorwatch.process.places import places_of
 
 FIRST_STEPS, STEPS = 2, 4
 """Gauss-Newton steps with the nominal filter's process noise, and without."""
