@@ -1,4 +1,4 @@
-"""What cannot be recorded raises an alarm: a full disk, a deleted folder, too many keys.
+"""Alarms about what cannot be recorded: a full disk, a deleted folder, too many keys."""
 
 A full disk stops the recording, with an alarm, and not the recorder; with space again it resumes.
 
