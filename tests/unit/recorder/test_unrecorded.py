@@ -1,12 +1,5 @@
 """Alarms about what cannot be recorded: a full disk, a deleted folder, too many keys."""
 
-A full disk stops the recording, with an alarm, and not the recorder; with space again it resumes.
-
-A folder or file that is deleted under a recorder raises the alarm, and recording resumes in a new file.
-
-Keys of other programs take no room from keys of the product, and what is not recorded raises an alarm.
-"""
-
 import errno
 import os
 import shutil
