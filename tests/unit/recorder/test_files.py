@@ -1,9 +1,4 @@
-"""The files of a recorder: each opens by itself; what is kept, deleted and recovered, and the black box.
-
-The files of a recorder: one after the other, each of which opens by itself; what is kept, what is deleted.
-
-Each file of a recorder states where it comes from; work in the background ends in its order, whatever fails.
-"""
+"""The files of a recorder: each opens by itself; what is kept, deleted and recovered, and the black box."""
 
 import os
 import tomllib
