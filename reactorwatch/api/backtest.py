@@ -10,16 +10,16 @@ import msgspec
 from monitor_node.replay.backtest import check_training_record, check_watched
 from monitor_node.replay.backtest import run as run_backtest
 from monitor_node.watched_process import WatchedProcess, limit_training, watch_process
+from reactorwatch import html
 from reactorwatch.api.backtest_report import backtest_headline, backtest_object, backtest_text
 from reactorwatch.api.monitor import Suspect, monitor_settings
 from reactorwatch.api.page import write_page
-from reactorwatch.api.record_view import signal_panels, time_title
+from reactorwatch.api.record_view import signal_panels
 from reactorwatch.api.records import ProcessLike
 from reactorwatch.contract.codec import encode
 from reactorwatch.description.find import find_process
-from reactorwatch.notebook import html
-from reactorwatch.notebook.figures import ALARM, Mark, draw_panels
-from reactorwatch.notebook.frames import frame_of_rows
+from reactorwatch.figures import Mark, Panel, draw
+from reactorwatch.optional import frame_of_rows
 from reactorwatch.records.record import Record
 from recorder.tools.player import samples_of
 
@@ -29,8 +29,6 @@ if TYPE_CHECKING:
 
 COLUMNS = ("alarm", "priority", "raised_min", "cleared_min", "signals", "cause", "probability")
 """Columns of the data frame."""
-
-TRAINING = "#7f7f7f"
 
 
 class RaisedAlarm(msgspec.Struct, frozen=True):
@@ -136,17 +134,19 @@ class BacktestResult(msgspec.Struct, frozen=True):
         Raises:
             InputError: matplotlib is not installed.
         """
+        return draw(self._panels())
+
+    def _panels(self) -> list[Panel]:
         record: Record = self.record
         inputs, outputs = tuple(self.signals["inputs"]), tuple(self.signals["outputs"])
         end_min = float(record.continuous_min[-1])
         marks = []
         if self.runs == 1:
             if self.trained_until_min is not None:
-                marks.append(Mark(float(record.time_min[0]), "training", TRAINING, end=self.trained_until_min))
+                marks.append(Mark(float(record.time_min[0]), "training", "measured", end=self.trained_until_min))
             spans = _merge_spans([(item.raised_min, item.cleared_min or end_min) for item in self.alarms])
-            marks += [Mark(start, "alarm" if not n else "", ALARM, end=end) for n, (start, end) in enumerate(spans)]
-        panels = signal_panels(record, inputs, names=(*outputs, *inputs))
-        return draw_panels(panels, marks, time_title(record))
+            marks += [Mark(start, "alarm" if not n else "", "alarm", end=end) for n, (start, end) in enumerate(spans)]
+        return signal_panels(record, inputs, names=(*outputs, *inputs), marks=tuple(marks))
 
     def to_html(self, file: str | Path) -> None:
         """Write the alarms and the plots as one page.
@@ -155,7 +155,7 @@ class BacktestResult(msgspec.Struct, frozen=True):
             InputError: the file cannot be written.
         """
         name = self.record.name
-        write_page(file, f"Back-test of {name}", self._repr_html_(), self.plot, name)
+        write_page(file, f"Back-test of {name}", self._repr_html_(), self._panels(), name)
 
 
 def backtest(record: Record, process: ProcessLike | None = None, **settings: Any) -> BacktestResult:
