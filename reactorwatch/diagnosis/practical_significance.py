@@ -142,7 +142,7 @@ def residual_exceeds_tolerance(
 
     Args:
         before: errors of the nominal model.
-        noise_sd: standard deviation of the sensors' noise, shape (n_y,), see `high_frequency_noise`.
+        noise_sd: standard deviation of the sensors' noise, shape (n_y,), see `colored_noise`.
         model: process model of the plant.
         bands: tolerances, by output.
     """

@@ -119,7 +119,7 @@ class AugmentedModel:
         interval_inputs: symbols of the interval means, one for each effect.
         sample_inputs: symbols of the sample values, one for each effect.
         shifts_time: for each effect, true if it shifts the timing; its interval input then is the rate at which the
-            shift grows (`input_timing`).
+            shift grows (`effective_timing`).
         constant_inputs: for each effect, the symbols of its own constants.
         nominal_constants: for each effect, their nominal values.
     """
