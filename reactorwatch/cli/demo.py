@@ -28,7 +28,6 @@ from reactorwatch.cli.processes import (
     write_node_settings,
 )
 from reactorwatch.contract import keys
-from reactorwatch.contract.alarm_text import suspects_text
 from reactorwatch.contract.codec import Encoded, decode
 from reactorwatch.contract.messages_pb2 import Alarm, Fault, Incident, Sample
 from reactorwatch.description.find import DEFAULT_PROCESS, find_process
@@ -45,6 +44,7 @@ from reactorwatch.runtime.crash import INTERRUPTED
 from reactorwatch.runtime.event_loop import StopSignal, stop_on_signals
 from reactorwatch.runtime.logs import configure
 from reactorwatch.runtime.loopback import free_endpoint
+from reactorwatch.sentences.alarm import suspects_text
 from reactorwatch.terminal import printable_lines
 from recorder.config import RecorderConfig
 from recorder.core import DISK_ALARM
