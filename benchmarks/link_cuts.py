@@ -34,11 +34,11 @@ from benchmarks.harness.site import (
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import decode
 from reactorwatch.contract.messages_pb2 import Sample
-from reactorwatch.runtime import logs
 from reactorwatch.runtime.bus_zenoh import ZenohBus
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.event_loop import StopSignal
-from reactorwatch.runtime.loopback import free_endpoint
+from reactorwatch.runtime.http_pages import free_endpoint
+from reactorwatch.runtime.node_main import configure_log
 from recorder.__main__ import record
 from recorder.config import RecorderConfig
 from recorder.files.recording import Recording
@@ -184,7 +184,7 @@ def stick(
 
 def main() -> None:
     """Print what was found."""
-    logs.configure()
+    configure_log()
     longest_s = float(sys.argv[1]) if len(sys.argv) > 1 else CUTS_S[-1]
     print(f"{RATE_PER_S:,} samples/s              published   missing  twice  out of order  slowest batch, ms")
     for span_s in (span for span in CUTS_S if span <= longest_s):

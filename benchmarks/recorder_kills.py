@@ -32,10 +32,10 @@ from benchmarks.harness.site import (
 from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import decode
-from reactorwatch.runtime import logs
 from reactorwatch.runtime.bus_zenoh import router
 from reactorwatch.runtime.config import BusConfig
-from reactorwatch.runtime.loopback import free_endpoint
+from reactorwatch.runtime.http_pages import free_endpoint
+from reactorwatch.runtime.node_main import configure_log
 from recorder.config import RecorderConfig
 from recorder.files.recording import Recording
 
@@ -119,7 +119,7 @@ def _numbers_and_end(path: Path) -> tuple[dict[str, list[int]], int]:
 
 def main() -> None:
     """Print what was lost."""
-    logs.configure()  # to standard error
+    configure_log()  # to standard error
     kills = int(sys.argv[1]) if len(sys.argv) > 1 else KILLS
     with tempfile.TemporaryDirectory() as folder:
         found = kill_often(Path(folder), kills, RATE_PER_S, seed=1)

@@ -23,11 +23,11 @@ from mcap.writer import Writer
 from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Encoded, Publication, decode, encode
-from reactorwatch.runtime import logs
 from reactorwatch.runtime.bus_zenoh import connect, router
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.event_loop import StopSignal
-from reactorwatch.runtime.loopback import free_endpoint
+from reactorwatch.runtime.http_pages import free_endpoint
+from reactorwatch.runtime.node_main import configure_log
 from recorder import RecordedMessage
 from recorder.config import RecorderConfig
 from recorder.core import Recorder
@@ -205,7 +205,7 @@ def fsync(folder: Path) -> None:
 
 def main() -> None:
     """Print the table."""
-    logs.configure()  # to standard error
+    configure_log()  # to standard error
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         sent = samples(RATE_PER_S * SECONDS)

@@ -55,8 +55,8 @@ from reactorwatch.contract.codec import Encoded, Publication
 from reactorwatch.runtime.bus_zenoh import connect
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.event_loop import StopSignal
-from reactorwatch.runtime.logs import configure
-from reactorwatch.runtime.loopback import free_endpoint
+from reactorwatch.runtime.http_pages import free_endpoint
+from reactorwatch.runtime.node_main import configure_log
 
 SIZES = (1, 10, 100, 1000, 10_000)
 FAST_SAMPLES = 600_000
@@ -280,7 +280,7 @@ def row_of(plants: int) -> str:
 
 def main() -> None:
     """Measure and print."""
-    configure(logging.WARNING)
+    configure_log(logging.WARNING)
     if len(sys.argv) > 1 and sys.argv[1] in ("route", "publish", "monitor", "bare"):
         command, endpoint, *numbers = sys.argv[1:]
         if command == "route":

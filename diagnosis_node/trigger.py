@@ -19,8 +19,8 @@ from reactorwatch.contract.keys import DEFAULT_PLANT, check_plant
 from reactorwatch.contract.messages_pb2 import Alarm, Sample
 from reactorwatch.errors import positive
 from reactorwatch.records.record import MINUTE_NS, NEVER_NS
-from reactorwatch.runtime.node import Node
-from reactorwatch.runtime.setting_rules import MODEL_IS_PROCESS, OlderKeys, check_bounds
+from reactorwatch.runtime.bus import Node
+from reactorwatch.runtime.config import MODEL_IS_PROCESS, OlderKeys, check_bounds
 from recorder import RecordedMessage
 
 HIDDEN_STATES = frozenset(CODES[state] for state in OUT_OF_SIGHT)  # alarms that trigger no diagnosis

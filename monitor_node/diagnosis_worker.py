@@ -8,8 +8,7 @@ from typing import NamedTuple, TypeVar
 
 from monitor_node.learn.training_diagnosis import FAILED, DiagnosisJob, Finding, diagnose_training
 from reactorwatch.limits import limits
-from reactorwatch.runtime.executors import ProcessExecutor
-from reactorwatch.runtime.jobs import Executor, Failed, one_line, run_job
+from reactorwatch.runtime.jobs import Executor, Failed, ProcessExecutor, one_line, run_job
 
 NICENESS = 10
 

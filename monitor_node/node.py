@@ -6,6 +6,7 @@ from pathlib import Path
 
 import structlog
 
+from monitor_node.alarms.commands import CommandRateLimiter, sender_name
 from monitor_node.alarms.incidents import is_empty
 from monitor_node.causes import stage
 from monitor_node.config import MonitorConfig
@@ -21,10 +22,9 @@ from reactorwatch.contract.codec import Encoded, Publication
 from reactorwatch.contract.messages_pb2 import Alarm, AlarmKpis, Baseline, CommandReply, Health, Incident
 from reactorwatch.errors import InputError
 from reactorwatch.records.write import make_folder
+from reactorwatch.runtime.acl import is_query
 from reactorwatch.runtime.bus import Bus
-from reactorwatch.runtime.metrics import Metrics
-from reactorwatch.runtime.security.acl import is_query
-from reactorwatch.runtime.security.command_rate import CommandRateLimiter, sender_name
+from reactorwatch.runtime.http_pages import Metrics
 from reactorwatch.runtime.start import instance_name
 from reactorwatch.sentences.alarm import state_word
 

@@ -26,7 +26,7 @@ from reactorwatch.contract.messages_pb2 import (
 from reactorwatch.errors import InputError
 from reactorwatch.process.fault import parse_fault
 from reactorwatch.records.record import to_time_ns
-from reactorwatch.runtime.node import Node
+from reactorwatch.runtime.bus import Node
 from reactorwatch.version import version
 
 NODE = "plant"

@@ -7,7 +7,7 @@ import msgspec
 
 from reactorwatch.contract import keys
 from reactorwatch.records.file_format import GUESS, FileFormat
-from reactorwatch.runtime.setting_rules import check_bounds
+from reactorwatch.runtime.config import check_bounds
 from recorder.keep import MAX_KEYS, Fsync
 
 MB = 1_000_000

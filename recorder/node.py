@@ -7,7 +7,7 @@ from reactorwatch.contract.codec import Encoded, Publication, encode
 from reactorwatch.contract.messages_pb2 import Alarm, CommandReply
 from reactorwatch.errors import InputError
 from reactorwatch.records.record import MINUTE_NS
-from reactorwatch.runtime.node import Node
+from reactorwatch.runtime.bus import Node
 from reactorwatch.runtime.reorder_buffer import Gap
 from recorder.config import MB, RecorderConfig
 from recorder.core import NODE, PRIORITIES, ReceivedMessage, Recorder

@@ -11,8 +11,7 @@ from typing import Any, TypeVar
 from rich.console import Console
 from rich.progress import Progress
 
-from reactorwatch.runtime.executors import choose_executor
-from reactorwatch.runtime.jobs import Failed
+from reactorwatch.runtime.jobs import Failed, choose_executor
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")

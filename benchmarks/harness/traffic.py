@@ -14,10 +14,10 @@ from plant_node.record import simulate_record
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, decode, encode, encoding_of
 from reactorwatch.contract.messages_pb2 import Alarm, Sample
+from reactorwatch.runtime.acl import NO_QUERYABLE
 from reactorwatch.runtime.bus_zenoh import connect, router
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.event_loop import StopSignal
-from reactorwatch.runtime.security.acl import NO_QUERYABLE
 from recorder.tools.player import samples_of
 
 SIGNALS = 3

@@ -21,7 +21,7 @@ from monitor_node.fleet.config import FleetConfig
 from reactorwatch.cli.processes import write_settings
 from reactorwatch.contract import keys
 from reactorwatch.runtime.config import BusConfig
-from reactorwatch.runtime.loopback import free_endpoint
+from reactorwatch.runtime.http_pages import free_endpoint
 
 ROOT = Path(__file__).parents[2]
 MONITORS = PARTS = 2

@@ -13,7 +13,7 @@ import msgspec
 from monitor_node.config import LARGEST_FALSE_ALARMS, LEAST_FALSE_ALARMS, MonitorConfig
 from reactorwatch.contract import keys
 from reactorwatch.errors import InputError
-from reactorwatch.runtime.setting_rules import check_bounds
+from reactorwatch.runtime.config import check_bounds
 from reactorwatch.spc.false_alarm_budget import DAYS
 
 MOST_SHARDS = 1000

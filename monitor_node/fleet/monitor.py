@@ -28,7 +28,7 @@ from reactorwatch.errors import InputError
 from reactorwatch.identification.rls import RecursiveLeastSquares
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import NEVER_NS
-from reactorwatch.runtime.node import Node
+from reactorwatch.runtime.bus import Node
 
 MOST_PLANTS = 100_000
 

@@ -351,7 +351,7 @@ def check_watched(name: object, outputs: Sequence[str], result: Backtest) -> Non
         why = ", ".join(f"{count} {reason}" for reason, count in sorted(result.refused.items()))
         raise UnfitRecordError(f"{name}: holds no sample that can be used{f'; refused: {why}' if why else ''}")
     if not result.signals.outputs:
-        reasons = "; ".join(f"{output}: {result.reasons_not_watched[output]}" for output in outputs)
+        reasons = "; ".join(f"{output}: {result.exclusions[output]}" for output in outputs)
         raise UnfitRecordError(f"{name}: there is no output to watch ({reasons})")
 
 

@@ -26,8 +26,7 @@ from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.decode import list_files, quote_formula
 from reactorwatch.records.file_format import GUESS, FileFormat
 from reactorwatch.records.write import atomic_write, fill_folder
-from reactorwatch.runtime.executors import choose_executor
-from reactorwatch.runtime.jobs import Failed, in_job_order
+from reactorwatch.runtime.jobs import Failed, choose_executor, in_job_order
 
 SUMMARY = SUMMARY_OBJECT, SUMMARY_TABLE = "summary.json", "summary.csv"
 Item = TypeVar("Item")

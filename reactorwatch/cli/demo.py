@@ -40,10 +40,9 @@ from reactorwatch.records.record import MINUTE_NS, to_minutes, to_time_ns
 from reactorwatch.records.write import atomic_write, make_folder
 from reactorwatch.runtime.bus_zenoh import ZenohBus
 from reactorwatch.runtime.config import section
-from reactorwatch.runtime.crash import INTERRUPTED
 from reactorwatch.runtime.event_loop import StopSignal, stop_on_signals
-from reactorwatch.runtime.logs import configure
-from reactorwatch.runtime.loopback import free_endpoint
+from reactorwatch.runtime.http_pages import free_endpoint
+from reactorwatch.runtime.node_main import INTERRUPTED, configure_log
 from reactorwatch.sentences.alarm import suspects_text
 from reactorwatch.terminal import printable_lines
 from recorder.config import RecorderConfig
@@ -75,7 +74,7 @@ def choose_fault(text: str | None, process: Process) -> FaultSpecification:
 
 def run(flags: dict[str, Any], fault: str | None, out: Path | None, site: Path | None = None) -> int:
     """Run the demonstration."""
-    configure()
+    configure_log()
     process = find_process(flags["process"] or DEFAULT_PROCESS)
     injected = str(choose_fault(fault, process))
     join = load_bus_settings(site, PLANT, {}, free_endpoint() if site is None else None)

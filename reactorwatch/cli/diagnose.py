@@ -3,6 +3,7 @@
 Errors in the options, not in a file, are raised before the first job.
 """
 
+import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from importlib.util import find_spec
@@ -33,7 +34,6 @@ from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.decode import is_table
 from reactorwatch.records.record import Record, to_time_ns
 from reactorwatch.records.write import atomic_write, check_output_folder, fill_folder, write_table
-from reactorwatch.runtime.model_file import write_extended_model
 from recorder.panels.base import ALARM, INPUT, LIMIT, MEASURED, PREDICTED, Colour, Series, TimePlot
 
 PAGE, OBJECT, MODEL, DRAWING = "report.html", "report.json", "extended.json", "report.rrd"
@@ -250,3 +250,13 @@ def _plots(diagnosis: Diagnosis, curves: Curves, model: ProcessModel, time_ns: N
     for given in model.inputs:
         held = Series(given.name, time_ns, curves.inputs[given.name], INPUT, held=True)
         yield TimePlot(f"{given.meaning} {given.name}", given.unit, (held,))
+
+
+def write_extended_model(path: Path, written: dict[str, Any]) -> None:
+    """Write the object from `ExtendedModel.to_object`; the file appears complete or not at all.
+
+    Raises:
+        InputError: the folder does not exist or cannot be written to.
+    """
+    with atomic_write(path) as temporary:
+        temporary.write_text(json.dumps(written, indent=2) + "\n", encoding="utf-8")

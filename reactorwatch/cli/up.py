@@ -36,7 +36,7 @@ from reactorwatch.limits import limits
 from reactorwatch.records.write import check_folder_name, make_folder
 from reactorwatch.runtime.config import BusConfig, LogConfig, MetricsConfig, read_settings, section
 from reactorwatch.runtime.event_loop import stop_on_signals
-from reactorwatch.runtime.logs import configure
+from reactorwatch.runtime.node_main import configure_log
 from recorder.config import RecorderConfig
 from recorder.keep import ENDING
 from recorder.recording_files import file_names
@@ -55,7 +55,7 @@ def run_until_stopped(
     """Run everything until SIGINT, SIGTERM or SIGHUP, or until a node ends by itself."""
     tables = read_settings(target.config)
     log_config = section(LogConfig, "log", tables, {})
-    configure(as_json=log_config.format == "json")
+    configure_log(as_json=log_config.format == "json")
     source = load_source(tables, flags, played)
     monitor = section(MonitorConfig, "monitor", tables, source.monitor_flags(tables))
     if isinstance(source.settings, PlantConfig):

@@ -251,3 +251,17 @@ class PlantProcesses:
         if plant in self._processes:
             return self._processes[plant]
         return next((item for pattern, item in self._processes.items() if fnmatchcase(plant, pattern)), None)
+
+
+def read_extended_model(path: Path) -> ExtendedModel:
+    """Read the model in a file.
+
+    Raises:
+        InputError: the file cannot be read, or holds no model; the text starts with its path.
+    """
+    try:
+        return parse_extended_model(read_regular(path))
+    except OSError as error:
+        raise InputError(f"model file {path}: cannot be read: {error.strerror}") from error
+    except InputError as error:
+        raise InputError(f"model file {path}: {error}") from error

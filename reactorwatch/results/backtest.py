@@ -131,7 +131,7 @@ class Backtest(Result, frozen=True, kw_only=True):
     )
 
     @property
-    def reasons_not_watched(self) -> dict[str, str]:
+    def exclusions(self) -> dict[str, str]:
         """Signals that are not watched, with the reason."""
         return {item.signal: item.why for item in self.signals.left_out}
 

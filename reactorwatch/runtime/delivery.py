@@ -17,8 +17,8 @@ from typing import NamedTuple
 
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded
+from reactorwatch.runtime.acl import ROLES, Role
 from reactorwatch.runtime.reorder_buffer import Gap, ReorderBuffer
-from reactorwatch.runtime.security.acl import ROLES, Role
 
 MAX_STREAMS_QUERIED = 100
 """Streams whose publishers are queried again at once: with more than that the network broke down, and the queries would

@@ -14,14 +14,13 @@ from collections.abc import Callable, Iterator
 from functools import partial
 from queue import Empty, SimpleQueue
 from types import FrameType
-from typing import TypeAlias
+from typing import TypeAlias, TypeVar
 
 from reactorwatch.contract.codec import Encoded, Publication, encode
-from reactorwatch.runtime.bus import MAX_BATCH, Bus, Request
-from reactorwatch.runtime.clock import SteadyClock
-from reactorwatch.runtime.node import Node
+from reactorwatch.errors import is_passing
+from reactorwatch.runtime.acl import audit
+from reactorwatch.runtime.bus import MAX_BATCH, Bus, Node, Request
 from reactorwatch.runtime.reorder_buffer import Gap
-from reactorwatch.runtime.security.acl import audit
 
 MAX_WAIT_S = 3600.0
 MAX_DRAIN_FACTOR = 10
@@ -385,3 +384,76 @@ class EventLoop:
             self._inbox.publication = self._published
             self._bus.publish(encode(publication))
             self._inbox.publication = 0
+
+
+class SteadyClock:
+    """Clock of a loop, from any thread: the machine's clock, but it never runs backwards and never stops.
+
+    If the machine's clock is set forward, this one follows at once. If it is set back, this one slews: it runs at 0.9
+    times its speed until the machine's clock has caught up; a node that followed would be idle for as long as the clock
+    was set back.
+
+    Args:
+        wall_ns: reads the machine's clock.
+        monotonic_ns: reads a clock that cannot be set.
+    """
+
+    def __init__(
+        self, wall_ns: Callable[[], int] = time.time_ns, monotonic_ns: Callable[[], int] = time.monotonic_ns
+    ) -> None:
+        self._wall_ns, self._monotonic_ns = wall_ns, monotonic_ns
+        self._lock = threading.Lock()
+        self._monotonic, self._now_ns = monotonic_ns(), wall_ns()
+
+    def now_ns(self) -> int:
+        """Nanoseconds since 1970-01-01 UTC."""
+        with self._lock:
+            monotonic = self._monotonic_ns()
+            slewed_ns = self._now_ns + int(0.9 * (monotonic - self._monotonic))
+            self._monotonic, self._now_ns = monotonic, max(self._wall_ns(), slewed_ns)
+            return self._now_ns
+
+
+Result = TypeVar("Result")
+
+
+def retry(
+    attempt: Callable[[], Result],
+    wait: Callable[[float], bool],
+    on_failure: Callable[[str, bool], object],
+    passes: Callable[[BaseException], bool] = is_passing,
+) -> Result | None:
+    """Call a function until it raises no error that can pass: a full disk, a folder without rights, a taken address.
+
+    Other errors are raised at once. The waits double from 0.1 s to 2 s.
+
+    Args:
+        attempt: the function.
+        wait: waits for so many seconds; returns True, early, once a stop is requested.
+        on_failure: called after each failure with its reason, and True if the failure before had another reason.
+        passes: True for an error that can pass.
+
+    Returns:
+        The result of the function; None if a stop was requested first.
+    """
+    retry_s, before = 0.1, ""
+    while not wait(0.0):
+        try:
+            return attempt()
+        except Exception as error:
+            if not passes(error):
+                raise
+            reason = describe(error)
+        on_failure(reason, reason != before)
+        before = reason
+        if wait(retry_s):
+            break
+        retry_s = min(2 * retry_s, 2.0)
+    return None
+
+
+def describe(error: BaseException) -> str:
+    """Reason of a failure in one line; an error of the system names its file."""
+    if isinstance(error, OSError) and error.strerror is not None:
+        return f"{error.filename}: {error.strerror}" if error.filename is not None else error.strerror
+    return next(iter(str(error).splitlines()), type(error).__name__)

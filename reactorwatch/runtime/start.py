@@ -25,8 +25,7 @@ from reactorwatch.runtime import bus_zenoh
 from reactorwatch.runtime.bus import Bus
 from reactorwatch.runtime.bus_zenoh import LEASE_S, ZenohBus
 from reactorwatch.runtime.config import BusConfig
-from reactorwatch.runtime.event_loop import StopSignal
-from reactorwatch.runtime.retry import Result, describe, retry
+from reactorwatch.runtime.event_loop import Result, StopSignal, describe, retry
 
 log = structlog.get_logger()
 

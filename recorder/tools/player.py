@@ -15,7 +15,7 @@ from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Body, Publication
 from reactorwatch.records.record import MINUTE_NS, NEVER_NS, Record, to_time_ns
-from reactorwatch.runtime.node import Node
+from reactorwatch.runtime.bus import Node
 from recorder import RecordedMessage
 from recorder.keep import STATES
 from recorder.samples import RunSplitter, decode_messages

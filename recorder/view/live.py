@@ -18,8 +18,7 @@ from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Encoded, Publication, encode, encode_message, encoding_of
 from reactorwatch.contract.messages_pb2 import Alarm
 from reactorwatch.description.process import Process
-from reactorwatch.runtime.bus import Bus
-from reactorwatch.runtime.node import Node
+from reactorwatch.runtime.bus import Bus, Node
 from recorder.columns import LISTED, SEGMENT_MESSAGES, RunReader
 from recorder.panels import PANELS
 from recorder.samples import content_of

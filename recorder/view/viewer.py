@@ -25,8 +25,7 @@ from reactorwatch.errors import InputError
 from reactorwatch.runtime import bus_zenoh
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.event_loop import EventLoop, StopSignal, stop_on_signals
-from reactorwatch.runtime.http_guard import GuardedPort
-from reactorwatch.runtime.loopback import free_port
+from reactorwatch.runtime.http_pages import GuardedPort, free_port
 from recorder.view.drawing import APPLICATION
 from recorder.view.live import HistoryQuery, LiveDashboard, query_history
 

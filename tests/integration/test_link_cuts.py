@@ -30,7 +30,7 @@ from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, decode
 from reactorwatch.contract.messages_pb2 import Sample
 from reactorwatch.runtime.config import BusConfig
-from reactorwatch.runtime.loopback import free_endpoint
+from reactorwatch.runtime.http_pages import free_endpoint
 from recorder.files.recording import Recording
 from recorder.tools.inspect import inspect
 

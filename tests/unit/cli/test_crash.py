@@ -21,7 +21,7 @@ from reactorwatch.contract.codec import Publication, encode
 from reactorwatch.contract.messages_pb2 import QUALITY_GOOD, Sample
 from reactorwatch.errors import InputError
 from reactorwatch.records.write import write_table
-from reactorwatch.runtime import crash
+from reactorwatch.runtime import node_main as crash
 from reactorwatch.runtime.config import read_settings
 from recorder import RecordedMessage
 from recorder.config import RecorderConfig

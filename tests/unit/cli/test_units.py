@@ -18,6 +18,7 @@ from reactorwatch.api.files import open_messages
 from reactorwatch.cli import backtest, identify
 from reactorwatch.cli.backtest import choose_settings
 from reactorwatch.cli.batch import Job
+from reactorwatch.cli.diagnose import write_extended_model
 from reactorwatch.cli.main import app
 from reactorwatch.description.find import DEFAULT_CHOICE, ProcessChoice
 from reactorwatch.diagnosis.units import find_wrong_unit
@@ -28,7 +29,6 @@ from reactorwatch.process.library.cstr import cstr
 from reactorwatch.records.record import Record
 from reactorwatch.records.write import write_table
 from reactorwatch.results.backtest import Backtest
-from reactorwatch.runtime.model_file import write_extended_model
 from reactorwatch.spc.charts.base import format_quantity
 from recorder.columns import find_model, read_run, signal_title
 from recorder.files.recording import Recording

@@ -17,8 +17,8 @@ from reactorwatch.contract.messages_pb2 import (
     SetInput,
     ShelveAlarm,
 )
+from reactorwatch.runtime.acl import audit
 from reactorwatch.runtime.event_loop import EventLoop, StopSignal
-from reactorwatch.runtime.security.acl import audit
 from tests.memory_bus import Exchange, MemoryBus
 from tests.running import WITHIN_S, running
 

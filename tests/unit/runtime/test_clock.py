@@ -1,6 +1,6 @@
 """The clock of a node's loop: as the machine's, but for when that is set back."""
 
-from reactorwatch.runtime.clock import SteadyClock
+from reactorwatch.runtime.event_loop import SteadyClock
 
 SECOND = 1_000_000_000
 

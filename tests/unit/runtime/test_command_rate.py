@@ -2,9 +2,9 @@
 
 import pytest
 
+from monitor_node.alarms.commands import ALL, MAX_NAMES, PER_NAME, CommandRateLimiter, sender_name
 from reactorwatch.contract.codec import Encoded, encode_message
 from reactorwatch.contract.messages_pb2 import AlarmCommand, ListAlarms
-from reactorwatch.runtime.security.command_rate import ALL, MAX_NAMES, PER_NAME, CommandRateLimiter, sender_name
 
 SECOND = 1_000_000_000
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from reactorwatch.errors import InputError
-from reactorwatch.runtime.crash import EXIT_CODE, print_error
+from reactorwatch.runtime.node_main import EXIT_CODE, print_error
 
 ROOT = Path(__file__).parents[3]
 PACKAGES = ("reactorwatch", "plant_node", "monitor_node", "recorder", "diagnosis_node")

@@ -9,11 +9,17 @@ from functools import partial
 
 import pytest
 
-from reactorwatch.runtime import http_guard
+from reactorwatch.runtime import http_pages as http_guard
 from reactorwatch.runtime.config import MetricsConfig
-from reactorwatch.runtime.http_guard import GuardedPort, guard_application, is_own_host
-from reactorwatch.runtime.loopback import LOOPBACK, free_port
-from reactorwatch.runtime.metrics import Metrics, serve_metrics
+from reactorwatch.runtime.http_pages import (
+    LOOPBACK,
+    GuardedPort,
+    Metrics,
+    free_port,
+    guard_application,
+    is_own_host,
+    serve_metrics,
+)
 from tests.running import WITHIN_S
 
 OWN = (

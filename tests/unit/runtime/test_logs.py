@@ -11,11 +11,11 @@ from pathlib import Path
 import pytest
 import structlog
 
-from reactorwatch.runtime.logs import LogFile, configure
+from reactorwatch.runtime.node_main import LogFile, configure_log
 
 
 def test_for_programs_each_line_is_an_object_with_the_fields_of_the_event(capsys: pytest.CaptureFixture[str]) -> None:
-    configure(as_json=True)
+    configure_log(as_json=True)
     log = structlog.get_logger()
     log.info("alarm", alarm="ewma/T", value=3.5, file=Path("a.mcap"))
     log.warning("a second\nline")
@@ -28,7 +28,7 @@ def test_for_programs_each_line_is_an_object_with_the_fields_of_the_event(capsys
 
 
 def test_an_error_has_its_traceback_in_the_object(capsys: pytest.CaptureFixture[str]) -> None:
-    configure(as_json=True)
+    configure_log(as_json=True)
     try:
         int("no")
     except ValueError:
@@ -40,7 +40,7 @@ def test_an_error_has_its_traceback_in_the_object(capsys: pytest.CaptureFixture[
 
 
 def test_for_people_it_is_a_line_of_text(capsys: pytest.CaptureFixture[str]) -> None:
-    configure()
+    configure_log()
     structlog.get_logger().info("alarm", alarm="ewma/T")
     (line,) = capsys.readouterr().err.splitlines()
     assert "alarm=ewma/T" in line
@@ -74,7 +74,7 @@ def test_lines_that_a_full_disk_refuses_are_counted_and_the_next_one_reports_it(
 
 def test_a_process_whose_log_cannot_be_written_runs_to_its_own_end() -> None:
     program = (
-        "import structlog; from reactorwatch.runtime import logs; logs.configure(); "
+        "import structlog; from reactorwatch.runtime.node_main import configure_log; configure_log(); "
         "[structlog.get_logger().info('row', n=n) for n in range(1000)]; raise SystemExit(7)"
     )
     with Path("/dev/full").open("wb") as full:

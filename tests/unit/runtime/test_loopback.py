@@ -5,7 +5,7 @@ import socket
 
 import pytest
 
-from reactorwatch.runtime.loopback import LOOPBACK, free_port, reserve_port
+from reactorwatch.runtime.http_pages import LOOPBACK, free_port, reserve_port
 from tests.ports import three_free_ports
 
 

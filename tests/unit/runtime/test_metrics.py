@@ -13,8 +13,7 @@ from reactorwatch.contract.codec import Publication
 from reactorwatch.contract.messages_pb2 import Alarm, AlarmState, Health, Sample
 from reactorwatch.errors import InputError
 from reactorwatch.runtime.config import MetricsConfig, section
-from reactorwatch.runtime.loopback import LOOPBACK
-from reactorwatch.runtime.metrics import PORT_OFFSET, Metrics, serve_metrics
+from reactorwatch.runtime.http_pages import LOOPBACK, PORT_OFFSET, Metrics, serve_metrics
 from tests.ports import three_free_ports
 from tests.running import WITHIN_S
 
@@ -168,7 +167,7 @@ def test_the_page_of_a_fleet_has_so_many_plants_and_one_that_leaves_makes_room(
     port: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("prometheus_client", reason="prometheus-client (reactorwatch[metrics]) is not installed")
-    monkeypatch.setattr("reactorwatch.runtime.metrics.MAX_PLANTS", 2)
+    monkeypatch.setattr("reactorwatch.runtime.http_pages.MAX_PLANTS", 2)
     with serve_metrics(MetricsConfig(port=port), Metrics("monitor")) as metrics:
         assert metrics is not None
         for plant in "abc":
@@ -221,7 +220,7 @@ def test_a_port_in_use_stops_no_node_is_reported_in_health_and_is_served_once_it
     port: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("prometheus_client", reason="prometheus-client (reactorwatch[metrics]) is not installed")
-    monkeypatch.setattr("reactorwatch.runtime.metrics.log", lines := Lines())
+    monkeypatch.setattr("reactorwatch.runtime.http_pages.log", lines := Lines())
     key = "reactor/R-101/health/monitor"
     taken = socket.create_server((LOOPBACK, port + 1))
     with closing(taken), serve_metrics(MetricsConfig(port=port), Metrics("monitor", {"R-101": None})) as metrics:

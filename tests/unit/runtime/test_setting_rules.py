@@ -16,8 +16,17 @@ from plant_node.config import PlantConfig
 from reactorwatch.cli.up import diagnosis_settings
 from reactorwatch.errors import InputError
 from reactorwatch.limits import Limits
-from reactorwatch.runtime.config import SECTIONS, BusConfig, LogConfig, MetricsConfig, section
-from reactorwatch.runtime.setting_rules import MAX_SPAN_S, PROTOCOLS, check_endpoint, valid_choices
+from reactorwatch.runtime.config import (
+    MAX_SPAN_S,
+    PROTOCOLS,
+    SECTIONS,
+    BusConfig,
+    LogConfig,
+    MetricsConfig,
+    check_endpoint,
+    section,
+    valid_choices,
+)
 from recorder.config import RecorderConfig, ReplayConfig
 from recorder.node import build_black_box
 

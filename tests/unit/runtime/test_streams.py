@@ -8,9 +8,9 @@ import pytest
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded
 from reactorwatch.contract.keys import matches
+from reactorwatch.runtime.acl import ROLES, access_control
 from reactorwatch.runtime.delivery import MAX_CACHED, Delivery, SequencedMessage, keys_of, role_of_key, stream_of
 from reactorwatch.runtime.reorder_buffer import Gap
-from reactorwatch.runtime.security.acl import ROLES, access_control
 
 ROOT = "reactor/cstr"
 KINDS = (

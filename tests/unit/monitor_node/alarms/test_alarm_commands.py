@@ -8,7 +8,7 @@ import pytest
 from google.protobuf.message import Message
 from msgspec.structs import replace
 
-from monitor_node.alarms.commands import COMMANDS
+from monitor_node.alarms.commands import COMMANDS, PER_NAME
 from monitor_node.config import MonitorConfig
 from monitor_node.node import MonitorNode
 from plant_node.node import COMMANDS as PLANT_COMMANDS
@@ -26,7 +26,6 @@ from reactorwatch.contract.messages_pb2 import (
 from reactorwatch.errors import InputError
 from reactorwatch.records.record import to_time_ns
 from reactorwatch.runtime.bus import Request
-from reactorwatch.runtime.security.command_rate import PER_NAME
 from tests.memory_bus import Exchange, MemoryBus
 
 from ..samples import PLANT, leaking_run, samples

@@ -6,6 +6,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
+from monitor_node.alarms.commands import PER_NAME
 from monitor_node.core import Monitor
 from monitor_node.fleet.config import FleetConfig
 from monitor_node.fleet.monitor import EVICT_NS
@@ -14,8 +15,7 @@ from monitor_node.storage.state_files import CLAIM
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication, encode_message
 from reactorwatch.contract.messages_pb2 import Alarm, AlarmCommand, AlarmKpis
-from reactorwatch.runtime.metrics import Metrics
-from reactorwatch.runtime.security.command_rate import PER_NAME
+from reactorwatch.runtime.http_pages import Metrics
 
 from ..fleets import PLANTS, QUICK, alarms, of, row_by_row, run_of
 

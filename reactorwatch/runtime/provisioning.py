@@ -26,8 +26,8 @@ from reactorwatch.errors import InputError
 from reactorwatch.limits import parse_json
 from reactorwatch.records.decode import read_regular
 from reactorwatch.records.write import atomic_write
-from reactorwatch.runtime.security.acl import ROLES, SERIAL_BYTES, access_control, common_name
-from reactorwatch.runtime.security.certificates import (
+from reactorwatch.runtime.acl import ROLES, SERIAL_BYTES, access_control, common_name
+from reactorwatch.runtime.certificates import (
     Identity,
     issue,
     make_authority,
@@ -35,7 +35,7 @@ from reactorwatch.runtime.security.certificates import (
     read_common_name,
     read_key,
 )
-from reactorwatch.runtime.setting_rules import LAST_PORT
+from reactorwatch.runtime.config import LAST_PORT
 
 AUTHORITY, ROUTER = "authority", "router"
 CA, CERTIFICATE, KEY = "ca.pem", "certificate.pem", "key.pem"
