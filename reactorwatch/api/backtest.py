@@ -7,16 +7,16 @@ from typing import TYPE_CHECKING, Any
 
 from monitor_node.replay.backtest import RecordFacts, check_training_record, check_watched, run
 from monitor_node.watched_process import WatchedProcess, limit_training, watch_process
+from reactorwatch import html
 from reactorwatch.api.monitor import monitor_settings
 from reactorwatch.api.page import write_page
-from reactorwatch.api.record_view import signal_panels, time_title
+from reactorwatch.api.record_view import signal_panels
 from reactorwatch.api.records import ProcessLike
 from reactorwatch.api.shown import Shown
 from reactorwatch.contract.codec import encode
 from reactorwatch.description.find import find_process
-from reactorwatch.notebook import html
-from reactorwatch.notebook.figures import ALARM, Mark, draw_panels
-from reactorwatch.notebook.frames import frame_of_rows
+from reactorwatch.figures import Mark, Panel, draw
+from reactorwatch.optional import frame_of_rows
 from reactorwatch.records.record import Record
 from reactorwatch.results.alarms import RaisedAlarm
 from reactorwatch.results.backtest import Backtest
@@ -29,8 +29,6 @@ if TYPE_CHECKING:
 
 COLUMNS = ("alarm", "priority", "raised_min", "cleared_min", "signals", "cause", "probability")
 """Columns of the data frame."""
-
-TRAINING = "#7f7f7f"
 
 
 class BacktestResult(Shown[Backtest]):
@@ -84,17 +82,19 @@ class BacktestResult(Shown[Backtest]):
         Raises:
             InputError: matplotlib is not installed.
         """
+        return draw(self._panels())
+
+    def _panels(self) -> list[Panel]:
         record: Record = self.record
         inputs, outputs = tuple(self.result.signals.inputs), tuple(self.result.signals.outputs)
         end_min = float(record.continuous_min[-1])
         marks = []
         if self.runs == 1:
             if self.trained_until_min is not None:
-                marks.append(Mark(float(record.time_min[0]), "training", TRAINING, end=self.trained_until_min))
+                marks.append(Mark(float(record.time_min[0]), "training", "measured", end=self.trained_until_min))
             spans = _merge_spans([(item.raised_min, item.cleared_min or end_min) for item in self.alarms])
-            marks += [Mark(start, "alarm" if not n else "", ALARM, end=end) for n, (start, end) in enumerate(spans)]
-        panels = signal_panels(record, inputs, names=(*outputs, *inputs))
-        return draw_panels(panels, marks, time_title(record))
+            marks += [Mark(start, "alarm" if not n else "", "alarm", end=end) for n, (start, end) in enumerate(spans)]
+        return signal_panels(record, inputs, names=(*outputs, *inputs), marks=tuple(marks))
 
     def to_html(self, file: str | Path) -> None:
         """Write the alarms and the plots as one page.
@@ -103,7 +103,7 @@ class BacktestResult(Shown[Backtest]):
             InputError: the file cannot be written.
         """
         name = self.record.name
-        write_page(file, f"Back-test of {name}", self._repr_html_(), self.plot, name)
+        write_page(file, f"Back-test of {name}", self._repr_html_(), self._panels(), name)
 
 
 def backtest(record: Record, process: ProcessLike | None = None, **settings: Any) -> BacktestResult:

@@ -1,13 +1,12 @@
-"""Figures of a diagnosis: measurements and simulations, residuals, and the causes."""
+"""Panels of a diagnosis: measurements and simulations, residuals, and the causes."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from reactorwatch.arrays import Array
-from reactorwatch.diagnosis.report.svg import Band, Line, plot
 from reactorwatch.diagnosis.result import NOMINAL, SD_95, Cause, Curves, Diagnosis, Experiment
+from reactorwatch.figures import Band, Line, Mark, Panel
 from reactorwatch.process.model import Output, ProcessModel
 
 BEFORE_ROWS, AFTER_ROWS = 100, 200
@@ -16,61 +15,27 @@ BEFORE_ROWS, AFTER_ROWS = 100, 200
 RESIDUALS_SHOWN = (4.0, 0.99, 1.25)
 """Axis of residuals: at least this many standard deviations, or this factor times this quantile."""
 
-EXTENDED = "extended simulation"
+ALTERNATIVES = ("after", "before", "input", "other", "measured")
+"""Kinds of the lines of up to five explanations."""
 
 
-@dataclass(frozen=True)
-class Picture:
-    """A figure with its title and legend.
-
-    Attributes:
-        title: quantity and unit.
-        legend: (text, class) of each line.
-        drawing: an `svg` element.
-    """
-
-    title: str
-    legend: tuple[tuple[str, str], ...]
-    drawing: str
-
-
-def _draw(
-    title: str,
-    alternative: str,
-    time_min: Array,
-    items: Sequence[Line | Band],
-    moments_min: Sequence[float] = (),
-    shown: tuple[float, float] | None = None,
-    unit: str = "min",
-) -> Picture:
-    """Picture with a text alternative; for the other arguments see `plot`."""
-    legend = dict.fromkeys((item.text, item.kind) for item in items if item.text)
-    return Picture(title, tuple(legend), plot(alternative, time_min, items, moments_min, shown, unit))
-
-
-def outputs(diagnosis: Diagnosis, model: ProcessModel) -> list[Picture]:
+def outputs(diagnosis: Diagnosis, model: ProcessModel) -> list[Panel]:
     """Measurements of each output, with the simulation before and with the extended one."""
-    nominal = diagnosis.verdict == NOMINAL
-    simulations = [("simulation", "after") if nominal else ("simulation as it was", "before")]
-    simulations += [(EXTENDED, "after")] if diagnosis.is_extended else []
-    return [
-        _picture(diagnosis, output, [simulation], slice(None)) for output in model.outputs for simulation in simulations
-    ]
+    return [_compare(diagnosis, output, slice(None)) for output in model.outputs]
 
 
-def closer(diagnosis: Diagnosis, model: ProcessModel) -> list[Picture]:
+def closer(diagnosis: Diagnosis, model: ProcessModel) -> list[Panel]:
     """Close-up of the rows where the two models differ: outputs and inputs."""
     curves = _curves(diagnosis)
     rows = _rows_of_interest(curves, diagnosis.causes)
-    both = [("simulation as it was", "before"), (EXTENDED, "after")]
-    result = [_picture(diagnosis, output, both, rows) for output in model.outputs]
+    result = [_compare(diagnosis, output, rows) for output in model.outputs]
     for item in model.inputs:
-        line = Line(curves.inputs[item.name][rows], "input", item.meaning, held=True)
-        result.append(_draw(f"{item.name}, {item.unit}", item.name, curves.time_min[rows], [line]))
+        line = Line(item.meaning, curves.time_min[rows], curves.inputs[item.name][rows], "input", steps=True)
+        result.append(Panel(f"{item.name}, {item.unit}", (line,)))
     return result
 
 
-def residuals(diagnosis: Diagnosis, model: ProcessModel) -> list[Picture]:
+def residuals(diagnosis: Diagnosis, model: ProcessModel) -> list[Panel]:
     """One-step-ahead residuals in standard deviations, without and with the cause."""
     curves = _curves(diagnosis)
     kinds = [("simulation as it is", "after" if diagnosis.verdict == NOMINAL else "before", curves.residual_before)]
@@ -88,51 +53,56 @@ def residuals(diagnosis: Diagnosis, model: ProcessModel) -> list[Picture]:
             least, share, more = RESIDUALS_SHOWN
             finite = np.abs(values[np.isfinite(values)])
             reach = max(more * float(np.quantile(finite, share)) if finite.size else 0.0, least)
-            items: list[Line | Band] = [Line(values, kind, text), Band(-ends, ends, "expected", "95 % of noise")]
-            alternative, title = f"residual of {output.name}, {text}", f"Residual of {output.name}, standard deviations"
-            moments = _onsets(diagnosis.causes)
-            result.append(_draw(title, alternative, curves.time_min, items, moments, (-reach, reach)))
+            items = (
+                Line(text, curves.time_min, values, kind),
+                Band("95 % of noise", curves.time_min, -ends, ends, "expected"),
+            )
+            title = f"Residual of {output.name}, standard deviations"
+            marks, alternative = _onsets(diagnosis.causes), f"residual of {output.name}, {text}"
+            result.append(Panel(title, items, marks, limits=(-reach, reach), text=alternative))
     return result
 
 
-def courses(diagnosis: Diagnosis) -> list[Picture]:
+def courses(diagnosis: Diagnosis) -> list[Panel]:
     """Deviation of each cause over time, with its 95 % band."""
     curves, result = _curves(diagnosis), []
     for cause in diagnosis.causes:
         course, ends = curves.deviation[cause.cause], interval(cause, curves)
-        items: list[Line | Band] = [Line(course, "after", "most likely"), Band(*ends, "certain", "95 % interval")]
+        items = (
+            Line("most likely", curves.time_min, course, "after"),
+            Band("95 % interval", curves.time_min, *ends, "after"),
+        )
         title = f"Size m of: {cause.label}{_unit(cause.parameters['size'].unit)}"
-        shown = _with_zero(course, *ends)
-        result.append(_draw(title, f"course of {cause.label}", curves.time_min, items, shown=shown))
+        result.append(Panel(title, items, limits=_with_zero(course, *ends), text=f"course of {cause.label}"))
     return result
 
 
-def experiment(proposed: Experiment, model: ProcessModel) -> list[Picture]:
+def experiment(proposed: Experiment, model: ProcessModel) -> list[Panel]:
     """Proposed input, outputs predicted by each explanation, and their differences."""
     curves = proposed.curves
     if curves is None:
         raise ValueError("an experiment without its curves cannot be drawn")
-    first, item = next(iter(curves.outputs)), model.inputs[0]
+    times, first, item = curves.time_min, next(iter(curves.outputs)), model.inputs[0]
     limits = {
-        name: [Line(np.full(curves.time_min.size, end), "limit", "limits") for end in proposed.limits[name]]
+        name: [Line("limits", times, np.full(times.size, end), "limit") for end in proposed.limits[name]]
         for name in (item.name, *model.output_names)
     }
-    items = [Line(curves.level, "input", item.meaning, held=True), *limits[item.name]]
-    result = [_draw(f"{item.name}, {item.unit}", f"proposed {item.name}", curves.time_min, items)]
+    given = (Line(item.meaning, times, curves.level, "input", steps=True), *limits[item.name])
+    result = [Panel(f"{item.name}, {item.unit}", given, text=f"proposed {item.name}")]
     for name, unit in ((output.name, output.unit) for output in model.outputs):
         lines = [
-            Line(columns[name], f"alternative{index}", label)
-            for index, (label, columns) in enumerate(curves.outputs.items())
+            Line(label, times, columns[name], kind)
+            for (label, columns), kind in zip(curves.outputs.items(), ALTERNATIVES, strict=False)
         ]
         title = f"{name}, {unit}, as predicted under each"
-        result.append(_draw(title, f"predicted {name}", curves.time_min, [*lines, *limits[name]]))
-        apart = [Line(line.values - lines[0].values, line.kind, line.text) for line in lines[1:]]
+        result.append(Panel(title, (*lines, *limits[name]), text=f"predicted {name}"))
+        apart = tuple(Line(line.label, times, line.y - lines[0].y, line.kind) for line in lines[1:])
         title = f"{name}, {unit}, less what is predicted under {first}"
-        result.append(_draw(title, f"differences of predicted {name}", curves.time_min, apart))
+        result.append(Panel(title, apart, text=f"differences of predicted {name}"))
     return result
 
 
-def law(diagnosis: Diagnosis) -> list[Picture]:
+def law(diagnosis: Diagnosis) -> list[Panel]:
     """Missing term over each of its variables: the smooth curve with its 95 % band, and the formula."""
     if diagnosis.law is None:
         return []
@@ -140,27 +110,26 @@ def law(diagnosis: Diagnosis) -> list[Picture]:
     for curve in diagnosis.law.curves:
         half = SD_95 * curve.smooth_sd
         ends = curve.smooth - half, curve.smooth + half
-        items: list[Line | Band] = [
-            Line(curve.smooth, "after", "smooth curve"),
-            Band(*ends, "certain", "95 % interval"),
-            Line(curve.formula, "limit", diagnosis.law.formula),
-        ]
+        items = (
+            Line("smooth curve", curve.values, curve.smooth, "after"),
+            Band("95 % interval", curve.values, *ends, "after"),
+            Line(diagnosis.law.formula, curve.values, curve.formula, "limit"),
+        )
         title = f"Missing term{_unit(diagnosis.law.unit)}, over {curve.variable}"
-        shown = _with_zero(curve.smooth, *ends)
-        alternative = f"missing term over {curve.variable}"
-        result.append(_draw(title, alternative, curve.values, items, shown=shown, unit=curve.unit))
+        shown, alternative = _with_zero(curve.smooth, *ends), f"missing term over {curve.variable}"
+        result.append(Panel(title, items, x_title=curve.unit, limits=shown, text=alternative))
     return result
 
 
-def unknown_course(diagnosis: Diagnosis) -> list[Picture]:
+def unknown_course(diagnosis: Diagnosis) -> list[Panel]:
     """Course of an unknown input, if there is one."""
     curves = _curves(diagnosis)
     unknown = curves.unknown
     if unknown is None:
         return []
     title, shown = f"Estimated as the size of: {unknown.label}{_unit(unknown.unit)}", _with_zero(*(unknown.size,) * 3)
-    line = Line(unknown.size, "after", "most likely")
-    return [_draw(title, "course of the unknown input", curves.time_min, [line], shown=shown)]
+    line = Line("most likely", curves.time_min, unknown.size, "after")
+    return [Panel(title, (line,), limits=shown, text="course of the unknown input")]
 
 
 def _unit(unit: str) -> str:
@@ -181,26 +150,27 @@ def interval(cause: Cause, curves: Curves) -> tuple[Array, Array]:
     return np.clip(lower, min(ends), max(ends)), np.clip(upper, min(ends), max(ends))
 
 
-def _picture(diagnosis: Diagnosis, output: Output, simulations: Sequence[tuple[str, str]], rows: slice) -> Picture:
-    """Measurements of an output and simulations by text and kind, all on the scale of both simulations."""
+def _compare(diagnosis: Diagnosis, output: Output, rows: slice) -> Panel:
+    """Measurements of an output, the simulation as it was, and the extended one."""
     curves, title = _curves(diagnosis), f"{output.name}, {output.unit}"
-    measured, before, after = (
-        columns[output.name][rows] for columns in (curves.measured, curves.simulated_before, curves.simulated_after)
-    )
-    models = np.concatenate([before, after, measured])
-    finite = models[np.isfinite(models)]
-    shown = (float(finite.min()), float(finite.max())) if finite.size else None
-    lines = [Line(measured, "measured", "measured")]
-    lines += [Line(after if text == EXTENDED else before, kind, text) for text, kind in simulations]
-    alternative = f"{title}: {', '.join(line.text for line in lines)}"
-    return _draw(title, alternative, curves.time_min[rows], lines, _onsets(diagnosis.causes), shown)
+    times, name = curves.time_min[rows], output.name
+    nominal = diagnosis.verdict == NOMINAL
+    before = ("simulation", "after") if nominal else ("simulation as it was", "before")
+    lines = [
+        Line("measured", times, curves.measured[name][rows]),
+        Line(before[0], times, curves.simulated_before[name][rows], before[1]),
+    ]
+    if diagnosis.is_extended:
+        lines.append(Line("extended simulation", times, curves.simulated_after[name][rows], "after"))
+    text = f"{title}: {', '.join(line.label for line in lines)}"
+    return Panel(title, tuple(lines), _onsets(diagnosis.causes), text=text)
 
 
 def _rows_of_interest(curves: Curves, causes: Sequence[Cause]) -> slice:
     """Rows around the first onset, or where the two models differ most."""
     onsets = _onsets(causes)
     if onsets:
-        centre = int(np.searchsorted(curves.time_min, min(onsets)))
+        centre = int(np.searchsorted(curves.time_min, min(mark.x for mark in onsets)))
     else:
         off = np.zeros(curves.time_min.size)
         for name, before in curves.simulated_before.items():
@@ -211,10 +181,10 @@ def _rows_of_interest(curves: Curves, causes: Sequence[Cause]) -> slice:
     return slice(begin, begin + BEFORE_ROWS + AFTER_ROWS)
 
 
-def _onsets(causes: Sequence[Cause]) -> list[float]:
+def _onsets(causes: Sequence[Cause]) -> tuple[Mark, ...]:
     """Onsets that were estimated and not given."""
-    result = [(cause.parameters["onset"], cause.run_shift_min) for cause in causes if "onset" in cause.parameters]
-    return [item.value + shift_min for item, shift_min in result if item.sd > 0.0]
+    result = [(cause, cause.parameters["onset"]) for cause in causes if "onset" in cause.parameters]
+    return tuple(Mark(onset.value + cause.run_shift_min, cause.label) for cause, onset in result if onset.sd > 0.0)
 
 
 def _with_zero(course: Array, lower: Array, upper: Array) -> tuple[float, float]:

@@ -1,12 +1,32 @@
-"""Data frames of results."""
+"""Optional libraries: their import, and the data frames that need one."""
 
+import importlib
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from reactorwatch.notebook.extra import import_optional
+from reactorwatch.errors import InputError
 
 if TYPE_CHECKING:
     from pandas import DataFrame
+
+
+def import_optional(module: str, purpose: str) -> Any:
+    """Import a module of an optional library.
+
+    Args:
+        module: name of the module.
+        purpose: what it is needed for, for the error.
+
+    Raises:
+        InputError: it is not installed.
+    """
+    try:
+        return importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        library = module.partition(".")[0]
+        raise InputError(
+            f"{purpose} needs {library}, which is not installed: pip install 'reactorwatch[notebook]'"
+        ) from error
 
 
 def make_frame(columns: Mapping[str, Any], index: str | None = None) -> "DataFrame":
