@@ -15,7 +15,7 @@ from reactorwatch.description.find import DEFAULT_CHOICE, ProcessChoice
 from reactorwatch.errors import InputError
 from reactorwatch.records.decode import TABLE_SUFFIXES, is_table, list_files
 from reactorwatch.records.file_format import GUESS, FileFormat
-from reactorwatch.records.record import Record, format_utc
+from reactorwatch.records.record import Record
 
 if TYPE_CHECKING:
     from reactorwatch.description.process import Process
@@ -108,14 +108,6 @@ class MessageSource(NamedTuple):
     read_as: str = ""
     process: "Process | None" = None
     measured: Record | None = None
-
-    def zero(self, first_ns: int) -> str | None:
-        """Time from which the minutes are counted, as ISO 8601; None: unknown.
-
-        Args:
-            first_ns: time of the first sample.
-        """
-        return format_utc(first_ns if self.zero_ns is None else self.zero_ns) if self.has_clock else None
 
 
 def open_messages(

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 from monitor_node.config import MonitorConfig
-from monitor_node.replay.backtest import Backtest, run
+from monitor_node.replay.backtest import run
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from reactorwatch.api.files import open_messages
@@ -28,6 +28,7 @@ from reactorwatch.process import MODELS
 from reactorwatch.process.library.cstr import cstr
 from reactorwatch.records.record import Record
 from reactorwatch.records.write import write_table
+from reactorwatch.results.backtest import Backtest
 from reactorwatch.spc.charts.base import format_quantity
 from recorder.columns import find_model, read_run, signal_title
 from recorder.files.recording import Recording

@@ -1,44 +1,14 @@
-"""Texts of alarms and suspects of incidents; a number that this version has no word for is shown as it is."""
+"""Alarms and their suspects in words; a number that this version has no word for is shown as it is."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable
 from datetime import UTC, datetime
-from types import MappingProxyType
 
-from reactorwatch.contract.messages_pb2 import Alarm, AlarmState, Priority, Suspect
+from reactorwatch.contract.messages_pb2 import AlarmState, Priority, Suspect
 
 MIN_PROBABILITY = 0.05
 """Probability below which a suspect is not shown."""
 
-MAX_INCIDENTS = 1000
-"""Incidents whose suspects are remembered; few change after others have begun."""
-
-_MINUTE_NS = 60_000_000_000
-
-
-def set_suspects(alarm: Alarm, suspects: Iterable[Suspect]) -> None:
-    """Replace the suspects of an alarm, as by those that its incident has now."""
-    del alarm.suspects[:]
-    alarm.suspects.extend(suspects)
-
-
-class NewSuspects:
-    """Tells incidents with new suspects from those that repeat theirs, as after a restart of a monitor.
-
-    Args:
-        suspects: suspects of incidents that were published before, by number of the incident.
-    """
-
-    def __init__(self, suspects: Mapping[int, Sequence[Suspect]] = MappingProxyType({})) -> None:
-        self._suspects = {number: list(items) for number, items in suspects.items()}
-
-    def update(self, number: int, suspects: Sequence[Suspect]) -> bool:
-        """True if an incident has suspects, and other ones than before."""
-        if not suspects:
-            return False
-        before, self._suspects[number] = self._suspects.pop(number, None), list(suspects)
-        if len(self._suspects) > MAX_INCIDENTS:
-            del self._suspects[next(iter(self._suspects))]  # the one that was published longest ago
-        return self._suspects.get(number) != before
+_MINUTE_NS = 60_000_000_000  # not of `records.record`, whose NumPy takes longer to import than a command to answer
 
 
 def describe_suspects(suspects: Iterable[Suspect]) -> str:
@@ -48,11 +18,13 @@ def describe_suspects(suspects: Iterable[Suspect]) -> str:
     >>> describe_suspects([lost, Suspect(cause="feed_flow", probability=0.06)])
     '15 % of the coolant lost (93 %), feed flow (6 %)'
     """
-    return ", ".join(
-        f"{item.text or item.cause.replace('_', ' ')} ({100 * item.probability:.0f} %)"
-        for item in suspects
-        if item.probability >= MIN_PROBABILITY
-    )
+    shown = (item for item in suspects if item.probability >= MIN_PROBABILITY)
+    return ", ".join(describe_suspect(item.cause, item.probability, item.text) for item in shown)
+
+
+def describe_suspect(cause: str, probability: float, text: str) -> str:
+    """A cause in words, with its probability."""
+    return f"{text or cause.replace('_', ' ')} ({100 * probability:.0f} %)"
 
 
 def suspects_text(suspects: Iterable[Suspect], zero_ns: int | None = None) -> str:
