@@ -17,8 +17,7 @@ from reactorwatch.records.decode import is_table
 from reactorwatch.records.record import format_utc, to_minutes
 from reactorwatch.runtime.config import parse_tables, read_settings, section
 from reactorwatch.version import UNKNOWN, describe_build, this_build
-from recorder.files.metadata import gaps_of
-from recorder.files.recording import Recording, has_clock
+from recorder.files.recording import Recording, gaps_of, has_clock
 from recorder.tools.inspect import zero_ns_of
 
 SETTINGS = "settings"

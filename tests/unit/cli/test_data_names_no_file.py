@@ -19,7 +19,7 @@ from reactorwatch.errors import InputError
 from reactorwatch.process.extended_model import FORMAT, ExtendedModel
 from recorder import RecordedMessage
 from recorder.config import ReplayConfig
-from recorder.files.metadata import PROCESS
+from recorder.files.recording import PROCESS
 from recorder.files.writer import RecordingWriter
 from recorder.tools.replay import open_tape
 
