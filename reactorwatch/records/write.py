@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 from reactorwatch.errors import InputError
 from reactorwatch.records.decode import PARQUET_SUFFIXES, list_files, quote_formula
+from reactorwatch.records.file_format import CLOCK_COLUMN, RUN_COLUMN, TIME_COLUMN
 
 if TYPE_CHECKING:
     from reactorwatch.records.record import Record  # it imports NumPy, and help is to be fast
@@ -312,9 +313,6 @@ def fill_folder(folder: Path) -> Iterator[Path]:
     finally:
         shutil.rmtree(temporary)
 
-
-TIME_COLUMN, RUN_COLUMN, CLOCK_COLUMN = "time_min", "run", "time"
-"""Columns beside the signals: minutes, the run of each row if there are several, and clock time if it is asked for."""
 
 WRITTEN_SUFFIXES = (".csv", ".gz", ".xlsx", ".parquet")
 
