@@ -32,8 +32,7 @@ from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from reactorwatch.arrays import Array
 from reactorwatch.contract.codec import decode
-from reactorwatch.description.find import find_process
-from reactorwatch.description.read import read_process_table
+from reactorwatch.description.read import find_process, read_process_table
 from reactorwatch.identification.black_box_filter import BlackBoxFilter
 from reactorwatch.identification.black_box_fit import fit_black_box
 from reactorwatch.identification.rls import RecursiveLeastSquares

@@ -6,11 +6,7 @@ import pytest
 import reactorwatch as rw
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
-from monitor_node.watch.promise import (
-    PlantPromise,
-    describe_rate,
-    extrapolate_count,
-)
+from monitor_node.watch.promise import PlantPromise, extrapolate_count
 from reactorwatch.contract.messages_pb2 import Promise
 from reactorwatch.records.record import Record
 
@@ -115,21 +111,16 @@ def test_counts_at_other_limits_follow_from_a_common_factor_of_the_residuals() -
     assert extrapolate_count(round(found), 1500.0, 4500.0, 1e6) == pytest.approx(4500.0 / 1e6 ** (1 / 1.44), rel=0.1)
 
 
-@pytest.mark.parametrize(("rate", "words"), [(1080.0, "1 in 40 min"), (20.0, "1 in 36 h"), (1.0, "1 in 30 days")])
-def test_rates_in_words(rate: float, words: str) -> None:
-    assert describe_rate(rate) == words
-
-
 def test_a_back_test_has_the_promise_for_the_rows_it_judged() -> None:
     time_min, columns = sound_run(80.0, seed=3)
     found = rw.backtest(Record(time_min, columns, "sound"), training_min=60.0, isolation=False, diagnose_training=False)
     assert found.promise is not None
-    assert found.promise["expected"] == found.expected_false_alarms
-    assert found.promise["expected"] < found.promise["expected_90"] < 0.01
-    assert {"checked_rows", "found_in_training", "expected_in_training", "kept", "can_keep_per_30_days"} < set(
-        found.promise
-    )
-    assert f"promise: {found.promise['text']}" in str(found)
+    assert found.promise.expected == found.expected_false_alarms
+    assert found.promise.expected < found.promise.expected_90 < 0.01
+    stated = found.to_dict()["promise"]
+    assert {"checked_rows", "found_in_training", "expected_in_training", "kept", "can_keep_per_30_days"} < stated.keys()
+    assert stated["text"] == found.promise["text"]
+    assert f"promise: {found.promise.text}" in str(found)
 
 
 def test_before_rows_are_judged_there_is_no_promise() -> None:
