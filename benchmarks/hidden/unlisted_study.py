@@ -34,7 +34,7 @@ class Outcome:
 
 def judge(effect: Unlisted, found: Diagnosis, seconds: float) -> Outcome:
     """Hold a diagnosis against the truth."""
-    near = tuple(found.locations)[:2]
+    near = tuple(item.location for item in found.locations[:2])
     forms: set[str] = set()
     if found.law is not None:
         forms = {found.law.form, *(item.form for item in found.law.rivals if item.delta_bic < NEAR_FIRST)}
