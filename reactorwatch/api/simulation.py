@@ -12,8 +12,7 @@ from reactorwatch import html
 from reactorwatch.api.record_view import record_html, signal_panels
 from reactorwatch.api.records import ProcessLike, Record, measured_fields, model_of, process_of
 from reactorwatch.arrays import Array
-from reactorwatch.diagnosis.impossible_values import check_values
-from reactorwatch.diagnosis.units import find_wrong_unit
+from reactorwatch.diagnosis.record_checks import check_values, find_wrong_unit
 from reactorwatch.errors import InputError
 from reactorwatch.figures import Panel
 from reactorwatch.process import named_effects

@@ -21,7 +21,7 @@ from reactorwatch.arrays import Array
 from reactorwatch.cli.batch import SUMMARY, FileOptions, Job, JobKind, JobResult, Row, as_table, make_jobs
 from reactorwatch.cli.display import json_line
 from reactorwatch.cli.options import check_recording
-from reactorwatch.diagnosis.experiment.constraints import check_limits
+from reactorwatch.diagnosis.experiment.inputs import check_limits
 from reactorwatch.diagnosis.parameter_priors import parse_priors
 from reactorwatch.diagnosis.practical_significance import check_tolerance
 from reactorwatch.diagnosis.record_checks import make_run

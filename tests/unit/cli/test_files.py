@@ -28,7 +28,7 @@ from reactorwatch.process.library.cstr import cstr
 from reactorwatch.records.record import Record, join_runs
 from reactorwatch.records.write import check_folder_name
 from reactorwatch.sentences.backtest import backtest_text
-from recorder.files.metadata import FILE_INDEX
+from recorder.files.recording import FILE_INDEX
 from recorder.files.writer import RecordingWriter
 from recorder.tools.convert import import_csv
 from recorder.tools.player import samples_of

@@ -20,8 +20,8 @@ from reactorwatch.cli.backtest import choose_settings
 from reactorwatch.cli.batch import Job
 from reactorwatch.cli.diagnose import write_extended_model
 from reactorwatch.cli.main import app
-from reactorwatch.description.find import DEFAULT_CHOICE, ProcessChoice
-from reactorwatch.diagnosis.units import find_wrong_unit
+from reactorwatch.description.read import DEFAULT_CHOICE, ProcessChoice
+from reactorwatch.diagnosis.record_checks import find_wrong_unit
 from reactorwatch.errors import InputError
 from reactorwatch.identification.identify import ModelForm
 from reactorwatch.process import MODELS

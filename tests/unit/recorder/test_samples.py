@@ -1,13 +1,17 @@
-"""The start of a new run of a plant, by the sequence numbers and times of its samples."""
+"""Samples of one plant: losses by sequence numbers, the start of a new run, and columns of values."""
 
+import math
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Any
 
+import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
+from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.messages_pb2 import Alarm, Sample
-from recorder.samples import RunSplitter
+from recorder.samples import RunSplitter, SampleSeries, SequenceCounter
 
 PERIOD = 6_000_000_000
 SIGNALS = ("qc", "C", "T")
@@ -150,3 +154,94 @@ def test_a_damaged_number_is_out_of_place_and_what_it_replaces_is_missing(row: i
     damaged = int(number != row)
     assert (splitter.strays, len(splitter.runs)) == (damaged, 1)
     assert sum(check.lost for check in splitter.counters.values()) == damaged
+
+
+def counted(sequences: list[int]) -> tuple[int, int, int]:
+    """(lost, duplicated, out of order) of samples of one publisher: a number's sample time grows with it."""
+    check = SequenceCounter()
+    for sequence in sequences:
+        check.update(sequence, sequence * 100)
+    return check.lost, check.duplicated, check.out_of_order
+
+
+@pytest.mark.parametrize(
+    ("sequences", "lost", "duplicated", "out_of_order"),
+    [
+        ([0, 1, 2], 0, 0, 0),
+        ([7, 8, 9], 0, 0, 0),  # nobody listened before 7
+        ([0, 1, 4], 2, 0, 0),
+        ([0, 1, 1, 2], 0, 1, 0),
+        ([0, 2, 1, 3], 0, 0, 1),
+        ([0, 5, 3, 3, 6], 3, 1, 1),
+        ([0, 5, 1, 2, 3, 4, 6], 0, 0, 4),
+        ([3, 1, 4], 0, 1, 0),  # from before the first one seen
+        ([0, 2**64 - 1], 2**64 - 2, 0, 0),
+    ],
+)
+def test_counts(sequences: list[int], lost: int, duplicated: int, out_of_order: int) -> None:
+    assert counted(sequences) == (lost, duplicated, out_of_order)
+
+
+def test_a_restarted_publisher_loses_only_what_its_new_run_skipped() -> None:
+    check = SequenceCounter()
+    for sequence, time_ns in ((0, 0), (1, 100), (2, 200), (0, 1000), (1, 1100), (4, 1400)):
+        check.update(sequence, time_ns)
+    assert (check.lost, check.duplicated, check.out_of_order) == (2, 0, 0)
+
+
+@given(st.permutations(range(30)), st.integers(0, 30))
+def test_what_came_at_last_is_not_lost_in_whatever_order_it_came(order: list[int], taken: int) -> None:
+    """Between the first and the highest number seen, what never came is lost, and nothing else."""
+    sequences = [0, *(number + 1 for number in order[:taken])]
+    lost, duplicated, out_of_order = counted(sequences)
+    highest = [max(sequences[: place + 1]) for place in range(len(sequences))]
+    assert lost == max(sequences) + 1 - len(sequences)
+    assert duplicated == 0
+    assert out_of_order == sum(now < top for now, top in zip(sequences, highest, strict=True))
+
+
+def test_the_memory_of_gaps_is_bounded() -> None:
+    skipping = list(range(0, 8 * SequenceCounter.max_gaps, 2))
+    lost, duplicated, out_of_order = counted([*skipping, 1, skipping[-1] - 1])
+    assert (lost, duplicated, out_of_order) == (len(skipping) - 2, 1, 1)
+
+
+def sampled(row: int, sequence: int | None = None, **given: float | str) -> messages.Sample:
+    stamps = {"time_ns": 100 + row * PERIOD, "sequence": row if sequence is None else sequence}
+    return messages.Sample(**{**stamps, "value": float(row), "quality": messages.QUALITY_GOOD, **given})  # type: ignore[arg-type]
+
+
+def test_samples_are_collected_by_run_and_signal() -> None:
+    series = SampleSeries()
+    for row, sequence in enumerate((*range(5), *range(6))):
+        for signal in ("qc", "T"):
+            series.add(signal, sampled(row, sequence, unit="K"))
+    assert [{name: list(values) for name, (_, values) in run.items()} for run in series.runs] == [
+        {"qc": [0.0, 1.0, 2.0, 3.0, 4.0], "T": [0.0, 1.0, 2.0, 3.0, 4.0]},
+        {"qc": [5.0, 6.0, 7.0, 8.0, 9.0, 10.0], "T": [5.0, 6.0, 7.0, 8.0, 9.0, 10.0]},
+    ]
+    assert series.units == {"qc": "K", "T": "K"}
+
+
+def test_a_stray_is_left_out() -> None:
+    series = SampleSeries()
+    for row in range(10):
+        series.add("T", sampled(row, 7_000 if row == 5 else None, **({"time_ns": 7} if row == 5 else {})))
+    (run,) = [run for run in series.runs if any(times for times, _ in run.values())]
+    assert list(run["T"][1]) == [0.0, 1.0, 2.0, 3.0, 4.0, 6.0, 7.0, 8.0, 9.0]
+    assert series.splitter.strays == 1
+
+
+@pytest.mark.parametrize(
+    "given", [{"quality": messages.QUALITY_BAD}, {"value": math.inf}, {"value": math.nan}, {"value": -1e300}]
+)
+def test_a_value_that_cannot_be_one_counts_as_not_measured(given: dict[str, Any]) -> None:
+    series = SampleSeries()
+    series.add("T", sampled(0, **given))
+    assert [math.isnan(value) for value in series.runs[0]["T"][1]] == [True]
+
+
+def test_a_message_without_quality_is_no_sample() -> None:
+    series = SampleSeries()
+    series.add("T", sampled(0, quality=messages.QUALITY_UNSPECIFIED))
+    assert series.runs == []

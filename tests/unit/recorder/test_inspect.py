@@ -6,28 +6,20 @@ from pathlib import Path
 from reactorwatch.cli.info import info_object
 from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
-from reactorwatch.contract.codec import Publication, encode
 from recorder import RecordedMessage
 from recorder.files.recording import Recording
 from recorder.files.writer import RecordingWriter
 from recorder.tools.inspect import FileInfo, MissingSamples, inspect, overview, zero_ns_of
 from tests.unit.recorder import golden
+from tests.unit.recorder.recording import SECOND, received
 
-SECOND = 1_000_000_000
 KEY = "reactor/cstr/sample/T"
-
-
-def entry(
-    key: str, message: messages.Sample | messages.Alarm, received_ns: int, *, latched: bool = False
-) -> RecordedMessage:
-    encoded = encode(Publication(key, message))
-    return RecordedMessage(*encoded[:3], received_ns, message.time_ns, latched)
 
 
 def sampled(*sequences: int) -> list[RecordedMessage]:
     """Samples that were taken a second apart, by their number, and received in this order."""
     return [
-        entry(
+        received(
             KEY, messages.Sample(time_ns=1000 + number * SECOND, sequence=number, quality=messages.QUALITY_GOOD), place
         )
         for place, number in enumerate(sequences, start=1)
@@ -39,7 +31,7 @@ def alarm(
 ) -> RecordedMessage:
     key = keys.key(plant, keys.ALARM, "ewma/T")
     message = messages.Alarm(time_ns=at, alarm="ewma/T", event=event, raised_ns=raised, cleared_ns=cleared)
-    return entry(key, message, at, latched=latched)
+    return received(key, message, at, latched=latched)
 
 
 def test_counts_and_times_are_those_of_the_entries() -> None:
@@ -123,7 +115,7 @@ def test_a_sample_at_time_0_is_a_sample() -> None:
         messages.Sample(time_ns=time_ns, sequence=n, quality=messages.QUALITY_GOOD)
         for n, time_ns in enumerate((-SECOND, 0, SECOND))
     ]
-    entries = [entry(KEY, item, 1) for item in at]
+    entries = [received(KEY, item, 1) for item in at]
     assert overview(entries[1:2]).sample_span_ns == (0, 0)
     assert overview(entries).sample_span_ns == (-SECOND, SECOND)
     assert overview([]).sample_span_ns is None

@@ -1,22 +1,125 @@
-"""Grid search for the magnitude and the onset of a discontinuous effect, such as valve stiction.
+"""Refine a fitted hypothesis where the loss has no gradient: onsets, knots, discontinuous effects.
 
-Its innovations are discontinuous in them, so there is no gradient: magnitudes are scanned on a wide grid, then near the
-best. The onset also decides the internal state of the effect from then on, so every row after an input change may be
-another onset, and with a slightly wrong magnitude the wrong onset may look best. But once an input has moved far, that
-state no longer depends on the onset. So the loss for an onset is roughly that of a run without the deviation before it
-plus that of a run with the deviation throughout after it: one run for each magnitude ranks all onsets, and only the
-likely ones are fitted.
+Refine the onset of an input-timing fault; only rows where the input changes are informative. Between two input changes
+all onsets are equivalent, and the loss has no slope towards the next interval. So once the other parameters are fitted,
+nearby intervals are tried; the search moves to the best of them as long as that gains.
+
+Number of knots of a piecewise-linear profile. With too few knots a curve cannot follow; each knot too many costs BIC,
+so that the curve loses to a wrong alternative. All counts are compared at once, linearised about a fit: a curve with
+few knots is nearly one on a fine grid, so the gram matrix of the fine grid's signatures serves all counts.
+
+Grid search for the magnitude and the onset of a discontinuous effect, such as valve stiction. Its innovations are
+discontinuous in them, so there is no gradient: magnitudes are scanned on a wide grid, then near the best. The onset
+also decides the internal state of the effect from then on, so every row after an input change may be another onset, and
+with a slightly wrong magnitude the wrong onset may look best. But once an input has moved far, that state no longer
+depends on the onset. So the loss for an onset is roughly that of a run without the deviation before it plus that of a
+run with the deviation throughout after it: one run for each magnitude ranks all onsets, and only the likely ones are
+fitted.
 """
 
 from collections.abc import Sequence
+from functools import cache
 from itertools import chain
+from math import log
 
 import numpy as np
 
 from reactorwatch.arrays import Array
-from reactorwatch.diagnosis.fitting.fault_filter import huber_loss, huber_row_losses
+from reactorwatch.diagnosis.fitting import signatures
+from reactorwatch.diagnosis.fitting.fault_filter import huber_clip, huber_loss, huber_row_losses
 from reactorwatch.diagnosis.fitting.hypothesis import MOST_STEPS, Fit, Hypothesis
+from reactorwatch.diagnosis.fitting.profiles import PiecewiseLinear, Step, hat_functions
 from reactorwatch.diagnosis.run import Run
+
+NEAR = np.array([-8, -4, -2, -1, 1, 2, 4, 8])
+"""Intervals to try, relative to the present one."""
+
+MOST_ROUNDS = 8
+LEAST_GAIN = 0.1
+"""Threshold in log likelihood."""
+
+
+def refine_onset(run: Run, hypothesis: Hypothesis, best: Fit, steps: int) -> Fit:
+    """Refine the onsets of steps that shift the timing; other profiles stay.
+
+    Args:
+        run: the record.
+        hypothesis: hypothesis with or without such a step.
+        best: fit of the hypothesis.
+        steps: maximum number of least-squares steps.
+    """
+    for index, profile in enumerate(hypothesis.profiles):
+        if isinstance(profile, Step) and hypothesis.filter.shifts_time(index):
+            best = _refine_onset(run, hypothesis, best, index, steps)
+    return best
+
+
+def _refine_onset(run: Run, hypothesis: Hypothesis, best: Fit, index: int, steps: int) -> Fit:
+    moves_min = np.concatenate([run.time_min[:1], run.time_min[run.input_changes], run.time_min[-1:]])
+    middles_min = 0.5 * (moves_min[1:] + moves_min[:-1])
+    for _ in range(MOST_ROUNDS):
+        size, onset_min = best.parameters[index]
+        here = int(np.searchsorted(moves_min, onset_min + size, side="right")) - 1
+        near = here + NEAR
+        trials = [np.array([size, onset]) for onset in middles_min[near[(near >= 0) & (near < middles_min.size)]]]
+        fits = hypothesis.evaluate_values(run, best, index, trials, best)
+        likeliest = min(fits, key=lambda item: item.loss, default=best)
+        if not likeliest.loss < best.loss - LEAST_GAIN:
+            break
+        best = hypothesis.fit(run, likeliest.parameters, steps)
+    return best
+
+
+COUNTS = (*range(3, 21), *range(22, 41, 2), *range(44, 81, 4))
+"""Numbers of knots that are compared; with many, one more or less is no difference."""
+
+GRID = 161
+"""Knots of the fine grid."""
+
+_RIDGE = 1e-9
+
+
+def select_knots(
+    grid: PiecewiseLinear, run: Run, hypothesis: Hypothesis, fit: Fit, index: int
+) -> tuple[PiecewiseLinear, Array]:
+    """Select the number of knots with the least predicted BIC; return the curve and its values.
+
+    Args:
+        grid: profile with `GRID` knots for the record's rows.
+        run: the record.
+        hypothesis: hypothesis with a piecewise-linear profile at `index`; that effect must not delay an output.
+        fit: fit of the hypothesis.
+        index: index of the effect.
+    """
+    curve = hypothesis.profiles[index]
+    assert isinstance(curve, PiecewiseLinear)
+    values = np.interp(grid.knots_min, curve.knots_min, fit.parameters[index][: curve.n_linear])
+    g = hypothesis.signatures(run, fit, index, grid)
+    information = signatures.gram_of_columns(g)
+    gradient = g.T @ huber_clip(fit.w[2:]).ravel() + information @ values
+    information += _RIDGE * np.trace(information) / GRID * np.eye(GRID)
+    promised: list[tuple[float, Array]] = []
+    for count in COUNTS:
+        on_grid = _on_grid(count)
+        a = on_grid.T @ gradient
+        parameters = _solve(on_grid.T @ information @ on_grid, a)
+        promised.append((count * log(run.values) - float(a @ parameters), parameters))
+    _, parameters = min(promised, key=lambda item: item[0])
+    return PiecewiseLinear(run.time_min, parameters.size), np.append(parameters, fit.parameters[index][curve.n_shape :])
+
+
+def _solve(information: Array, a: Array) -> Array:
+    try:
+        return np.asarray(np.linalg.solve(information, a))
+    except np.linalg.LinAlgError:  # the record carries no information about the effect
+        return np.asarray(np.linalg.lstsq(information, a, rcond=1e-12)[0])
+
+
+@cache
+def _on_grid(count: int) -> Array:
+    """Hat functions of `count` knots at the fine grid's knots, shape (GRID, count)."""
+    return hat_functions(np.linspace(0.0, 1.0, GRID), count)
+
 
 _SIZES = ((4.0, 12), (4.0, 48), (1.06, 9), (1.015, 7))  # reach to either side as a factor, number of sizes
 _FINELY = ((1.06, 25), (1.006, 25), (1.0006, 25))

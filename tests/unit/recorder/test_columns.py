@@ -1,4 +1,4 @@
-"""A recording as columns."""
+"""A recording as columns, with the predictions of the reference that judges and of the one beside it."""
 
 import numpy as np
 import pytest
@@ -8,6 +8,8 @@ from reactorwatch.contract.codec import Encoded, Publication, encode
 from reactorwatch.errors import InputError
 from recorder import RecordedMessage
 from recorder.columns import ADAPTIVE, EQUATIONS, FROZEN, REFERENCE, RunColumns, SegmentContext, read_run, read_segments
+from recorder.panels import signals
+from recorder.panels.base import TimePlot
 from tests.unit.recorder import golden
 
 
@@ -162,3 +164,53 @@ def test_a_reconstruction_is_a_column_beside_its_signal() -> None:
     run = read_run(encode(Publication("reactor/cstr/reconstruction/T", item)) for item in told)
     assert run.reconstructions["T"].value.tolist() == [441.0, 442.0, 443.0]
     assert run.reconstructions["T"].sd.tolist() == [0.5, 0.5, 0.5]
+
+
+SAMPLE_ROWS = 5
+
+
+def estimate(row: int, prediction: float) -> messages.Estimate:
+    return messages.Estimate(time_ns=row, prediction=prediction, residual=0.5, unit="K")
+
+
+def judged_entries() -> list[RecordedMessage]:
+    published = []
+    for row in range(1, SAMPLE_ROWS + 1):
+        sample = messages.Sample(time_ns=row, value=400.0, unit="K", quality=messages.QUALITY_GOOD)
+        published += [
+            Publication("reactor/cstr/sample/T", sample),
+            Publication("reactor/cstr/estimate/T", estimate(row, 399.5)),
+            Publication("reactor/cstr/estimate/T/arx", estimate(row, 400.0 + row)),
+        ]
+    published += [
+        Publication(
+            "reactor/cstr/health/monitor",
+            messages.Health(time_ns=3, node="monitor", phase="watching", reference="black-box"),
+        ),
+        Publication("reactor/cstr/model/T", messages.ModelSnapshot(time_ns=3, structure="arx", reference=True)),
+    ]
+    return [RecordedMessage(*encode(item)[:3], item.message.time_ns, item.message.time_ns) for item in published]
+
+
+@pytest.fixture(scope="module")
+def judged_run() -> RunColumns:
+    return read_run(judged_entries())
+
+
+def test_both_predictions_are_drawn_and_the_one_that_judges_is_named(judged_run: RunColumns) -> None:
+    (plot,) = [item for item in signals.draw_overview(judged_run) if isinstance(item, TimePlot)]
+    legends = {series.name: series.legend for series in plot.series}
+    assert legends["predicted"] == "predicted by black-box"
+    assert legends["predicted beside"] == "arx, for comparison"
+    beside = next(series for series in plot.series if series.name == "predicted beside")
+    np.testing.assert_array_equal(beside.value, 400.0 + np.arange(1, SAMPLE_ROWS + 1))
+    assert [item.title for item in signals.draw_charts(judged_run)] == ["Residual of T"]
+
+
+def test_a_recursive_model_that_judges_is_drawn_as_one_that_adapts(judged_run: RunColumns) -> None:
+    assert list(judged_run.models) == [("T", ADAPTIVE)]
+
+
+def test_the_reference_is_known_in_later_segments() -> None:
+    segments = list(read_segments(judged_entries(), 3))
+    assert [segment.reference for segment in segments][-1] == "black-box"
