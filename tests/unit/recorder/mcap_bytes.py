@@ -57,7 +57,7 @@ def index_of(chunk: Chunk, record: bytes, at: int) -> ChunkIndex:
 def recording(
     chunks: list[Chunk], indexed_bytes: int | None = None, *, indexed: bool = True, further: bytes = b""
 ) -> bytes:
-    """A file of these chunks; the index claims another size of the last one, if it is given, and has further records."""
+    """A file of these chunks; the index may claim another size of the last one, and have further records."""
     content = MCAP0_MAGIC + bytes_of(Header(profile="", library=""))
     indexes = []
     for item in chunks:

@@ -267,7 +267,7 @@ def all_parts(notes: str = "") -> Parts:
     return "ros2", metadata, {"plant.png": PICTURE}, 1
 
 
-def test_a_cut_keeps_them_of_several_recordings_equal_ones_once_and_no_profile_where_they_differ(
+def test_a_cut_keeps_them_equal_ones_once_and_of_several_profiles_none(
     tmp_path: Path,
 ) -> None:
     source, new, always = foreign(tmp_path / "a.mcap", notes="a"), tmp_path / "new.mcap", Window((0, LATEST_NS))
