@@ -20,7 +20,7 @@ import structlog
 import tomli_w
 
 from reactorwatch.contract import keys
-from reactorwatch.description.find import PlantProcesses
+from reactorwatch.description.read import PlantProcesses
 from reactorwatch.errors import InputError
 from reactorwatch.records.write import make_folder
 from reactorwatch.runtime.reorder_buffer import Gap

@@ -14,7 +14,7 @@ from reactorwatch.api.record_view import signal_panels
 from reactorwatch.api.records import ProcessLike
 from reactorwatch.api.shown import Shown
 from reactorwatch.contract.codec import encode
-from reactorwatch.description.find import find_process
+from reactorwatch.description.read import find_process
 from reactorwatch.figures import Mark, Panel, draw
 from reactorwatch.optional import frame_of_rows
 from reactorwatch.records.record import Record

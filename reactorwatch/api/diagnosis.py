@@ -11,8 +11,8 @@ import msgspec
 from reactorwatch import html
 from reactorwatch.api.records import ProcessLike, check_signals, process_of
 from reactorwatch.api.report_origin import report_origin
-from reactorwatch.description.find import find_process
 from reactorwatch.description.process import Process
+from reactorwatch.description.read import find_process
 from reactorwatch.description.toml_file import add_description
 from reactorwatch.diagnosis.diagnose import diagnose as find_causes
 from reactorwatch.diagnosis.record_checks import make_run

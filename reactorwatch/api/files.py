@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from reactorwatch.contract.codec import Encoded, encode
 from reactorwatch.contract.keys import DEFAULT_PLANT, check_plant
-from reactorwatch.description.find import DEFAULT_CHOICE, ProcessChoice
+from reactorwatch.description.read import DEFAULT_CHOICE, ProcessChoice
 from reactorwatch.errors import InputError
 from reactorwatch.records.decode import TABLE_SUFFIXES, is_table, list_files
 from reactorwatch.records.file_format import GUESS, FileFormat
@@ -40,8 +40,7 @@ def record(
     Raises:
         InputError: the file is neither a table nor an .mcap, or is malformed.
     """
-    from reactorwatch.description.find import find_process
-    from reactorwatch.description.read import convert_to_process, read_process_table
+    from reactorwatch.description.read import convert_to_process, find_process, read_process_table
 
     described = process or find_process()
     if file_kind(path) == "mcap":

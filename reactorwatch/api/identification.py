@@ -10,7 +10,7 @@ import msgspec
 from reactorwatch import html
 from reactorwatch.api.page import write_page
 from reactorwatch.api.records import ProcessLike, process_of
-from reactorwatch.description.find import find_process
+from reactorwatch.description.read import find_process
 from reactorwatch.errors import InputError, describe_unknown
 from reactorwatch.figures import Line, Panel, draw
 from reactorwatch.identification.data import Dataset

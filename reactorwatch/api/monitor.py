@@ -18,8 +18,8 @@ from reactorwatch.contract.codec import Publication, encode
 from reactorwatch.contract.messages_pb2 import Alarm, Incident, Quality, Sample
 from reactorwatch.contract.messages_pb2 import Suspect as SuspectMessage
 from reactorwatch.contract.suspects import NewSuspects
-from reactorwatch.description.find import find_process
 from reactorwatch.description.process import Process
+from reactorwatch.description.read import find_process
 from reactorwatch.errors import InputError
 from reactorwatch.records.record import Record, to_minutes, to_time_ns
 from reactorwatch.results.alarms import Suspect

@@ -12,9 +12,8 @@ from reactorwatch.api.files import described_process
 from reactorwatch.api.files import record as read_file
 from reactorwatch.api.page import write_page
 from reactorwatch.api.record_view import record_frame, record_html, signal_panels
-from reactorwatch.description.find import DEFAULT_PROCESS, find_process
 from reactorwatch.description.process import Process
-from reactorwatch.description.read import convert_to_process
+from reactorwatch.description.read import DEFAULT_PROCESS, convert_to_process, find_process
 from reactorwatch.errors import InputError, describe_unknown
 from reactorwatch.figures import Panel, draw
 from reactorwatch.process import MODELS

@@ -30,8 +30,8 @@ from reactorwatch.cli.options import check_recording
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import DecodeError, Encoded, decode
 from reactorwatch.contract.messages_pb2 import Sample
-from reactorwatch.description.find import DEFAULT_PROCESS, ProcessChoice
 from reactorwatch.description.process import Process
+from reactorwatch.description.read import DEFAULT_PROCESS, ProcessChoice
 from reactorwatch.errors import prefix_errors
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.decode import quote_formula

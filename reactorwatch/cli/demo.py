@@ -30,8 +30,8 @@ from reactorwatch.cli.processes import (
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, decode
 from reactorwatch.contract.messages_pb2 import Alarm, Fault, Incident, Sample
-from reactorwatch.description.find import DEFAULT_PROCESS, find_process
 from reactorwatch.description.process import Process
+from reactorwatch.description.read import DEFAULT_PROCESS, find_process
 from reactorwatch.diagnosis.result import NAMED, Diagnosis
 from reactorwatch.errors import InputError
 from reactorwatch.process.effect import Effect

@@ -10,8 +10,8 @@ from monitor_node.replay.verification import COMPARED, Verification, verify
 from reactorwatch.cli.display import json_line, print_lines, print_report, task
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded
-from reactorwatch.description.find import ProcessChoice, find_in_catalogue, find_process
 from reactorwatch.description.process import Process
+from reactorwatch.description.read import ProcessChoice, find_in_catalogue, find_process
 from reactorwatch.errors import InputError
 from reactorwatch.records.decode import is_table
 from reactorwatch.records.record import format_utc, to_minutes

@@ -29,7 +29,7 @@ from reactorwatch.cli.processes import (
     write_node_settings,
     write_settings,
 )
-from reactorwatch.description.find import DEFAULT_PROCESS, find_process
+from reactorwatch.description.read import DEFAULT_PROCESS, find_process
 from reactorwatch.diagnosis.practical_significance import check_tolerance
 from reactorwatch.errors import InputError
 from reactorwatch.limits import limits

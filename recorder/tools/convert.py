@@ -11,9 +11,8 @@ import numpy as np
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import encode
 from reactorwatch.contract.messages_pb2 import Sample
-from reactorwatch.description.find import DEFAULT_CHOICE, ProcessChoice
 from reactorwatch.description.process import Process
-from reactorwatch.description.read import convert_to_process, read_signals
+from reactorwatch.description.read import DEFAULT_CHOICE, ProcessChoice, convert_to_process, read_signals
 from reactorwatch.errors import InputError
 from reactorwatch.records.decode import is_table
 from reactorwatch.records.file_format import GUESS, FileFormat

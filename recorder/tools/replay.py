@@ -19,8 +19,7 @@ import structlog
 
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Publication
-from reactorwatch.description.find import ProcessChoice
-from reactorwatch.description.read import read_signals
+from reactorwatch.description.read import ProcessChoice, read_signals
 from reactorwatch.errors import InputError
 from reactorwatch.records.decode import is_table
 from reactorwatch.records.record import NEVER_NS, to_time_ns

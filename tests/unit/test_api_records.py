@@ -8,7 +8,7 @@ import pyarrow as pa
 import pytest
 
 import reactorwatch as rw
-from reactorwatch.description.find import ProcessChoice
+from reactorwatch.description.read import ProcessChoice
 from reactorwatch.records.record import Record as MeasuredRecord
 from reactorwatch.records.write import write_table
 from recorder.tools.convert import import_csv

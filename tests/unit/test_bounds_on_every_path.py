@@ -18,7 +18,7 @@ from monitor_node.watched_process import load_process
 from reactorwatch.api.monitor import monitor_settings
 from reactorwatch.cli.main import app
 from reactorwatch.contract.codec import encode
-from reactorwatch.description.find import ProcessChoice
+from reactorwatch.description.read import ProcessChoice
 from reactorwatch.records.write import write_table
 from reactorwatch.results.backtest import Backtest
 from recorder.config import ReplayConfig

@@ -17,7 +17,7 @@ from reactorwatch.contract.messages_pb2 import (
     Sample,
     Suspect,
 )
-from reactorwatch.description.find import find_process
+from reactorwatch.description.read import find_process
 
 S = 10**9
 START_NS = 1_000 * S

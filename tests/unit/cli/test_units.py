@@ -20,7 +20,7 @@ from reactorwatch.cli.backtest import choose_settings
 from reactorwatch.cli.batch import Job
 from reactorwatch.cli.diagnose import write_extended_model
 from reactorwatch.cli.main import app
-from reactorwatch.description.find import DEFAULT_CHOICE, ProcessChoice
+from reactorwatch.description.read import DEFAULT_CHOICE, ProcessChoice
 from reactorwatch.diagnosis.record_checks import find_wrong_unit
 from reactorwatch.errors import InputError
 from reactorwatch.identification.identify import ModelForm

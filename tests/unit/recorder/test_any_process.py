@@ -18,9 +18,8 @@ from plant_node.record import simulate_record
 from reactorwatch.cli.diagnose import DiagnosisOptions, load_case
 from reactorwatch.cli.info import info_object, info_text
 from reactorwatch.contract.codec import encode
-from reactorwatch.description.find import PlantProcesses, ProcessChoice, find_process
 from reactorwatch.description.process import ROLES, Process, Signal
-from reactorwatch.description.read import read_process_table
+from reactorwatch.description.read import PlantProcesses, ProcessChoice, find_process, read_process_table
 from reactorwatch.errors import InputError
 from reactorwatch.process import MODELS
 from reactorwatch.process.fault import parse_fault

@@ -20,7 +20,7 @@ from mcap.records import (
 )
 from mcap.summary import Summary
 
-from reactorwatch.description.find import find_process
+from reactorwatch.description.read import find_process
 from reactorwatch.errors import InputError
 from recorder import RecordedMessage
 from recorder.files.copies import Window, cut, recover

@@ -12,7 +12,7 @@ from rerun.chunk import RrdReader
 from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Encoded, Publication, encode
-from reactorwatch.description.find import find_process
+from reactorwatch.description.read import find_process
 from reactorwatch.runtime.bus import Request
 from recorder.columns import RunColumns, read_run
 from recorder.view import live

@@ -13,8 +13,8 @@ from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Encoded, Publication, encode
 from reactorwatch.contract.messages_pb2 import Power, Promise
-from reactorwatch.description.find import find_process
 from reactorwatch.description.process import Process, Signal
+from reactorwatch.description.read import find_process
 from recorder.columns import (
     ADAPTIVE,
     EQUATIONS,

@@ -17,7 +17,7 @@ from reactorwatch.api.files import expand_folder
 from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import decode, encoding_of
-from reactorwatch.description.find import find_process
+from reactorwatch.description.read import find_process
 from reactorwatch.errors import InputError
 from reactorwatch.version import build_metadata
 from recorder import RecordedMessage

@@ -6,7 +6,7 @@ from textwrap import dedent
 
 import pytest
 
-from reactorwatch.description.find import find_process
+from reactorwatch.description.read import find_process
 from reactorwatch.errors import InputError
 
 EXCHANGER = """
