@@ -1,4 +1,4 @@
-"""Noise is told from model error, coloured noise from white, and a sensor whose noise grows is a cause."""
+"""Sensor noise beside model error, coloured noise beside white, and a sensor whose noise grows as a cause."""
 
 import json
 from collections.abc import Callable
