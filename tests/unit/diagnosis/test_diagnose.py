@@ -14,9 +14,7 @@ from reactorwatch.arrays import Array
 from reactorwatch.diagnosis.diagnose import diagnose
 from reactorwatch.diagnosis.holdout import OBSERVED_ROWS, holdout_rows
 from reactorwatch.diagnosis.record_checks import make_run
-from reactorwatch.diagnosis.report.machine import as_object
 from reactorwatch.diagnosis.report.page import as_page
-from reactorwatch.diagnosis.report.plain import as_text
 from reactorwatch.diagnosis.result import AMBIGUOUS, NAMED, NOMINAL, UNKNOWN
 from reactorwatch.errors import InputError
 from reactorwatch.kalman.ekf import Filter
@@ -26,6 +24,7 @@ from reactorwatch.process.effect import Effect
 from reactorwatch.process.extended_model import parse_extended_model
 from reactorwatch.process.library.cstr import EFFECTS, cstr
 from reactorwatch.records.record import Record, join_runs
+from reactorwatch.sentences.diagnosis import diagnosis_text
 from tests.tables import read_csv
 from tests.unit.diagnosis.linear_tank import NOISE_SD, PERIOD_MIN, Shift, follows, tank
 from tests.unit.diagnosis.runs import record_of
@@ -213,13 +212,13 @@ def test_a_plant_that_was_started_again_is_sound(start_min: float) -> None:
 def test_a_fault_is_found_at_the_minute_that_the_clock_showed(leaking: Record, by_min: float) -> None:
     record = set_back(leaking, by_min)
     found = diagnose(record, cstr(), CATALOGUE)
-    said = as_object(found, "run.csv", 1.0)
-    (cause,) = said["causes"]
-    assert (cause["cause"], cause["run"], said["runs"]) == ("coolant_flow", 2, 2)
-    assert cause["parameters"]["onset"]["value"] == pytest.approx(ONSET_MIN - by_min, abs=0.1)
+    (cause,) = found.causes
+    assert (cause.cause, cause.run, found.runs) == ("coolant_flow", 2, 2)
+    assert cause.to_dict()["run"] == 2
+    assert cause.parameters["onset"].value == pytest.approx(ONSET_MIN - by_min, abs=0.1)
     extended = parse_extended_model(msgspec.json.encode(found.extended_model))
-    assert extended.effects[0].values["onset"] == cause["parameters"]["onset"]["value"]
-    text = as_text(found, "run.csv", CATALOGUE)
+    assert extended.effects[0].values["onset"] == cause.parameters["onset"].value
+    text = diagnosis_text(found, CATALOGUE)
     assert "of run 2" in text
     assert "2 runs" in text
 
@@ -292,8 +291,8 @@ def test_a_model_of_ones_own_is_diagnosed_with_whatever_catalogue(
     named = effects_of(model) if effects is None else effects
     assert (found.verdict, bool(found.causes)) == (verdict, verdict in (NAMED, AMBIGUOUS))
     assert found.significant == found.practical == (verdict != NOMINAL)
-    assert json.loads(json.dumps(as_object(found, "a.csv", 1.0)))["verdict"] == verdict
-    assert as_text(found, "a.csv", named).startswith("a.csv")
+    assert json.loads(json.dumps(found.to_dict()))["verdict"] == verdict
+    assert diagnosis_text(found, named).startswith(found.file)
     assert as_page(found, model, named, "a.csv", "m.json", "x.csv", on_the_bus=False).startswith("<!doctype html>")
 
 

@@ -16,8 +16,6 @@ from reactorwatch.diagnosis.holdout import evaluate_holdout, holdout_rows
 from reactorwatch.diagnosis.lasting import fit_lasting, prefer_lasting
 from reactorwatch.diagnosis.record_checks import make_run
 from reactorwatch.diagnosis.report.page import as_page
-from reactorwatch.diagnosis.report.plain import as_text
-from reactorwatch.diagnosis.report.words import describe_verdict
 from reactorwatch.diagnosis.result import NAMED, NOMINAL, UNKNOWN, Diagnosis
 from reactorwatch.diagnosis.run import Run
 from reactorwatch.diagnosis.search.search import FittedHypothesis, Search, SearchResult, smallest_noise
@@ -30,6 +28,7 @@ from reactorwatch.process.library.cstr import EFFECTS, cstr
 from reactorwatch.process.library.three_tanks import three_tanks
 from reactorwatch.process.simulate import Simulator
 from reactorwatch.records.record import Record
+from reactorwatch.sentences.diagnosis import describe_verdict, diagnosis_text
 from tests.unit.diagnosis.rig import LOWER_SPILL_PER_MIN, NOISE_V, Rig, record_of
 from tests.unit.diagnosis.runs import make_run as reactor_run
 
@@ -69,7 +68,7 @@ def test_another_brim_and_another_share_that_is_caught_are_fitted() -> None:
     assert found.gain.held_out["x2"].rmse_after < 1.15 * NOISE_V
     extended = parse_extended_model(json.dumps(found.extended_model)).build()
     assert extended.parameter("overflow.brim").value == pytest.approx(cause.parameters["brim"].value)
-    assert "brim 7.5" in as_text(found, "tanks.csv", effects_of(tanks()))
+    assert "brim 7.5" in diagnosis_text(found, effects_of(tanks()))
 
 
 @pytest.mark.parametrize(
