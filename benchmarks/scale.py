@@ -47,7 +47,7 @@ from benchmarks.harness.traffic import (
 from monitor_node.__main__ import UNCACHED, watch
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
-from monitor_node.fleet.config import FleetConfig
+from monitor_node.fleet import FleetConfig
 from monitor_node.monitor_state import SEAL
 from monitor_node.node import MonitorNode
 from reactorwatch.contract import keys

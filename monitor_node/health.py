@@ -21,9 +21,6 @@ HEARD_AGAIN_NS = 1_000_000
 STALL_NS = 1_000_000_000
 """Due work is done within a millisecond; a monitor this late was stalled, or its clock was set."""
 
-LONGEST_CAUSE = 300
-"""Characters of an exception's own text in a report; a value in it may be of any length."""
-
 MOST_GROUPS = 1000
 """Largest number of groups; tokens of further ones are ignored, as anyone may declare tokens."""
 
@@ -95,7 +92,7 @@ class Failures:
         if origin in self._reported:
             return
         self._reported.add(origin)
-        cause = " ".join(str(error).split())[:LONGEST_CAUSE]
+        cause = " ".join(str(error).split())[:300]
         self.notes.append(f"error of this software in the stage {stage}: {origin}: {cause}; {cost}; please report it")
         self.tracebacks.append("".join(traceback.format_exception(error)))
 

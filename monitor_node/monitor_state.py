@@ -12,15 +12,14 @@ import msgspec
 
 from monitor_node.alarms.annunciator import AnnunciatorMemory
 from monitor_node.config import MonitorConfig
-from monitor_node.ingest.duplicates import AlignmentMemory
 from monitor_node.ingest.intake import IntakeMemory
+from monitor_node.ingest.rows import AlignmentMemory
 from monitor_node.watch.pipeline import PipelineMemory
 from reactorwatch.errors import InputError
 from reactorwatch.process.model import ProcessModel, fingerprint
 from reactorwatch.version import this_build
 
 DIGEST_BYTES = 16
-_VERSION_BYTES = 2
 
 
 class ForeignFileError(InputError):
@@ -42,7 +41,7 @@ class Seal(NamedTuple):
 
     def close(self, body: bytes) -> bytes:
         """Seal a body: word, version, digest and body."""
-        return self.word + self.version.to_bytes(_VERSION_BYTES, "big") + _digest(body) + body
+        return self.word + self.version.to_bytes(2, "big") + _digest(body) + body
 
     def open(self, data: bytes) -> bytes:
         """Body of sealed bytes.
@@ -51,7 +50,7 @@ class Seal(NamedTuple):
             ForeignFileError: the bytes are not a state of this kind.
             InputError: the state is truncated, damaged or of another version.
         """
-        head_bytes = len(self.word) + _VERSION_BYTES
+        head_bytes = len(self.word) + 2
         head, body = data[:head_bytes], data[head_bytes + DIGEST_BYTES :]
         is_intact = data[head_bytes : head_bytes + DIGEST_BYTES] == _digest(body)
         if not head.startswith(self.word) or len(head) < head_bytes:

@@ -18,13 +18,15 @@ import msgspec
 
 from monitor_node.alarms.alarms import (
     LAST_NS,
+    Activation,
     AlarmChange,
     AlarmMemory,
     ChartAlarm,
+    Incident,
+    KpiCounter,
     SuspectedCause,
     TimeNs,
 )
-from monitor_node.alarms.incidents import Activation, Incident, KpiCounter
 from monitor_node.config import MonitorConfig, PriorityName
 from reactorwatch.contract import keys
 from reactorwatch.contract.alarm_states import CODES, UNACKNOWLEDGED_STATES, Event, State, is_consistent, next_state

@@ -46,15 +46,6 @@ FEW_ROWS = 300
 ROWS_BEFORE = 400
 """Number of rows before the first alarm that late looks use."""
 
-LEAST = 0.01
-"""Probability below which a suspect is not published."""
-
-CONVINCED = 0.5
-"""Probability from which a suspected sensor is reconstructed."""
-
-MARGIN_MIN = 1.0
-"""Time before the estimated onset from which the sensor is left out."""
-
 START_STEPS, START_STEPS_A_ROW = 25_000 + STEPS_PER_PREDICTION * MOST_PIECES, STEPS_PER_ROW
 """Filter steps for the past rows: enough for each row and a search for steady states."""
 
@@ -145,7 +136,8 @@ class Reconstruction:
         self._filter.budget = StepBudget(START_STEPS + START_STEPS_A_ROW * len(past))
         try:
             for time_min, inputs, measured in past:
-                self._step(time_min, inputs, measured, is_right=time_min < onset_min - MARGIN_MIN)
+                # the sensor is left out from a minute before the estimated onset on
+                self._step(time_min, inputs, measured, is_right=time_min < onset_min - 1.0)
         except BudgetExceededError:  # the filter diverges again and again: start with the next row instead
             self._filter.restart()
         self._filter.budget, self.memory.filter = None, self._filter.state
@@ -284,7 +276,7 @@ class Suspicion:
         isolation.fitter.progress = self.memory.progress
         suspects = isolation.suspects(self._rows_of_look(since), min(since, FEW_ROWS))
         self.memory.progress = isolation.fitter.progress
-        shown = [item for item in suspects if item.probability >= LEAST]
+        shown = [item for item in suspects if item.probability >= 0.01]
         self._board.set_suspects(shown, stopped=isolation.stopped)
         self._follow(suspects[0])
 
@@ -308,7 +300,7 @@ class Suspicion:
         """Start or stop the reconstruction of a sensor."""
         effect = self._effects.get(suspect.cause)
         output = effect.output if isinstance(effect, SensorEffect) else ""
-        if suspect.probability >= CONVINCED and output in self._config.outputs:
+        if suspect.probability >= 0.5 and output in self._config.outputs:
             self._reconstruct(output, suspect.cause, suspect.onset_ns / MINUTE_NS, self.memory.rows.rows())
         elif self._reconstructed_cause != STUCK_SENSOR:
             self._stop_reconstruction()

@@ -34,9 +34,6 @@ from reactorwatch.stored_state import Memory, read_memory
 SD = "sd"
 """The unit of what charts show: standard deviations of the residual."""
 
-MOST_ENTRIES = 3
-"""Signals that an alarm names as possible entries of a disturbance."""
-
 
 class ChartsMemory(Memory):
     """Memory of the charts of a plant.
@@ -409,7 +406,7 @@ class ChartWatch:
                     if charts.locates:
                         change.entries = [
                             SuspectedCause(name, share, kind="process", text=f"the disturbance enters at {name}")
-                            for name, share in islice(change.contributions.items(), MOST_ENTRIES)
+                            for name, share in islice(change.contributions.items(), 3)
                         ]
                 else:
                     charts.restart(index)

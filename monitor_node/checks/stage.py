@@ -13,12 +13,9 @@ import numpy as np
 from monitor_node.alarms.alarms import AlarmChange
 from monitor_node.alarms.annunciator import Annunciator
 from monitor_node.checks.base import CheckRow, CheckTraining, Judged, SignalCheck
-from monitor_node.checks.range import RangeCheck
-from monitor_node.checks.silence import SilenceCheck
-from monitor_node.checks.spike import SpikeCheck
-from monitor_node.checks.stuck import StuckCheck
+from monitor_node.checks.signal_checks import RangeCheck, SilenceCheck, SpikeCheck, StuckCheck
 from monitor_node.config import MonitorConfig
-from monitor_node.learn.signal_range import SignalRange
+from monitor_node.watched_process import SignalRange
 from reactorwatch.arrays import Array
 from reactorwatch.spc.false_alarm_budget import TrainingErrors
 from reactorwatch.spc.prewhitening import Prewhitening

@@ -41,9 +41,6 @@ from reactorwatch.spc.charts.base import Judgement
 from reactorwatch.spc.charts.parameters import ParameterT2
 from reactorwatch.stored_state import Memory, copy_of
 
-SCALING_ROWS = 50
-"""Rows from which the scaling is made; there is no prediction before."""
-
 MEMORY = 10_000
 """Rows after which an adaptive model that judges has forgotten a row."""
 
@@ -223,7 +220,7 @@ class ArxPredictor(Memory, dict=True):
         if not all(map(isfinite, row)):
             return
         self.first_rows.append(row)
-        if len(self.first_rows) == SCALING_ROWS:
+        if len(self.first_rows) == 50:
             rows = np.array(self.first_rows)
             self._scale(Scaling.of(rows[:, :-1], rows[:, -1]))
             self.first_rows.clear()

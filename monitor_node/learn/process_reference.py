@@ -25,9 +25,6 @@ from reactorwatch.process.model import MODEL_CACHE_SIZE, ProcessModel
 from reactorwatch.records.record import MINUTE_NS
 from reactorwatch.stored_state import Memory, copy_of
 
-MOST_UNKNOWN = 1
-"""Rows in succession whose input may be unknown; after more, the filter restarts."""
-
 
 class ProcessMemory(Memory, tag="process"):
     """Memory of a `ProcessReference`.
@@ -186,7 +183,7 @@ class ProcessReference(FilterReference):
         inputs, missing = row.inputs, row.interval.missing
         unknown = any(memory.guessed) + memory.held_rows + missing
         if all(map(isfinite, inputs)):
-            if unknown > MOST_UNKNOWN:
+            if unknown > 1:
                 self._filter.interrupt()
             elif unknown:
                 changes = self._possible_changes(time_min, inputs)

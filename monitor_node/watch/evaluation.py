@@ -13,9 +13,8 @@ from monitor_node.alarms.annunciator import Annunciator
 from monitor_node.causes.stage import Suspicion, SuspicionMemory, has_causes
 from monitor_node.charts.chart_design import count_chance_alarms
 from monitor_node.charts.charts import ChartsMemory, ChartWatch
-from monitor_node.charts.drift import DriftWatch
-from monitor_node.charts.shift import NAME as SHIFT
-from monitor_node.charts.shift import ShiftWatch
+from monitor_node.charts.shift_and_drift import NAME as SHIFT
+from monitor_node.charts.shift_and_drift import DriftWatch, ShiftWatch
 from monitor_node.checks.base import CheckTraining
 from monitor_node.checks.stage import SignalChecks
 from monitor_node.config import MonitorConfig
@@ -26,11 +25,11 @@ from monitor_node.learn.baseline import TrainingResult
 from monitor_node.learn.black_box_reference import BlackBoxMemory
 from monitor_node.learn.process_reference import ProcessMemory
 from monitor_node.learn.references import Reference
-from monitor_node.learn.signal_range import possible_ranges, stated_ranges
 from monitor_node.learn.training_rows import TrainingRows
 from monitor_node.watch.power import Watch
 from monitor_node.watch.promise import PlantPromise, PromiseStage
 from monitor_node.watch.row_step import OrdinaryRows
+from monitor_node.watched_process import possible_ranges, stated_ranges
 from reactorwatch.arrays import Array
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Publication

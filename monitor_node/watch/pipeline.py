@@ -23,16 +23,15 @@ from monitor_node.health import NODE, Failures
 from monitor_node.ingest.rows import MeasuredRow, Row, SamplingPeriod
 from monitor_node.learn.arx import ArxReference
 from monitor_node.learn.baseline import NO_VALUE, TrainingResult
-from monitor_node.learn.model_update import is_command
-from monitor_node.learn.signal_range import input_bounds
 from monitor_node.learn.training import TrainingMemory
 from monitor_node.learn.training_diagnosis import DiagnosisJob, Finding
 from monitor_node.learn.training_rows import TrainingRows
-from monitor_node.watch.baselines import Baselines, ModesMemory
+from monitor_node.watch.baselines import Baselines, ModesMemory, is_command
 from monitor_node.watch.evaluation import Evaluation, EvaluationMemory, check_promise
 from monitor_node.watch.operation import CarriedState, Operation
 from monitor_node.watch.promise import PromiseStage
 from monitor_node.watch.row_step import EVENT, VIOLATING
+from monitor_node.watched_process import input_bounds
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Publication
 from reactorwatch.contract.messages_pb2 import Alarm, Baseline, Estimate

@@ -35,8 +35,6 @@ from reactorwatch.spc.prewhitening import Prewhitening
 HORIZONS_MIN = (10.0, 60.0, 1440.0)
 FIELDS = ("within_10_min", "within_1_h", "within_1_day")
 RAMP = "ramp"
-ONSETS = 6
-"""Onsets along the first half of the training."""
 
 RUNS = 2
 """Onsets of which a black box is run."""
@@ -45,7 +43,6 @@ MOST_ROWS = 600
 """Rows after an onset that are computed; later ones are like their later half."""
 
 FEWEST_ROWS = 20
-_BIAS_SDS = 1.0
 
 
 class Deviation(NamedTuple):
@@ -167,7 +164,7 @@ def _causes(watch: Watch, arrays: RowArrays) -> list[Deviation]:
     dynamics = replace(dynamics, whitening=diagonal)
     intervals = window.time_min.size - 1
     rows = min(MOST_ROWS, intervals // 2)
-    onsets = np.linspace(1, intervals - rows, ONSETS).astype(int)
+    onsets = np.linspace(1, intervals - rows, 6).astype(int)
     profile = (np.arange(intervals)[:, None] >= onsets).astype(np.float64)
     found = []
     for index, effect in enumerate(effects):
@@ -192,7 +189,7 @@ def _biases(watch: Watch, arrays: RowArrays) -> list[Deviation]:
         if responses is not None:
             paths[0, :, index] = np.nan_to_num(responses[index])
         if usual is not None:
-            size, runs = _BIAS_SDS * reference.typical_sd[index], []
+            size, runs = 1.0 * reference.typical_sd[index], []
             for onset in onsets:
                 shifted = measured.copy()
                 shifted[onset:, index] += size

@@ -17,7 +17,7 @@ from scipy.special import pdtrc
 
 from monitor_node.alarms.annunciator import Annunciator
 from monitor_node.charts.chart_design import alarm_names
-from monitor_node.charts.shift import NAME as SHIFT
+from monitor_node.charts.shift_and_drift import NAME as SHIFT
 from monitor_node.checks.stage import SignalChecks
 from monitor_node.config import MonitorConfig
 from monitor_node.health import NODE, Failures
@@ -36,12 +36,6 @@ from reactorwatch.stored_state import Memory, Storable
 
 UNLIKELY = 0.003
 """Probability of so many alarms by chance below which the promise is not kept."""
-
-FEWEST_EVENTS = 3
-"""Least number of separate events of a plant that is called drifted: one or two may be faults."""
-
-SAME_EVENT_ROWS = 20
-"""Rows within which alarms are of the same event."""
 
 REMEDY = "train longer, or over more set points"
 
@@ -93,7 +87,7 @@ class PlantPromise(Memory):
             row: number of rows judged since the training.
         """
         had_drifted = self.has_drifted(row)
-        self.events += not self.found or row - self.last_row > SAME_EVENT_ROWS
+        self.events += not self.found or row - self.last_row > 20
         self.found, self.last_row = self.found + count, row
         return had_drifted, self.has_drifted(row)
 
@@ -108,7 +102,8 @@ class PlantPromise(Memory):
     def has_drifted(self, rows: int) -> bool:
         """True if more events raised alarms in a number of rows than chance explains, by all that is known."""
         upper = max(self.check.excess * self.mean_count(rows), self.upper_count(rows))
-        return self.events >= FEWEST_EVENTS and float(pdtrc(self.events - 1, upper)) < UNLIKELY
+        # one or two may be faults
+        return self.events >= 3 and float(pdtrc(self.events - 1, upper)) < UNLIKELY
 
     @property
     def is_kept(self) -> bool:
@@ -227,9 +222,6 @@ def extrapolate_count(found: int, arl0: float, opportunities: float, wanted_arl0
 
 RAISED = Event.RAISED.value
 
-LEAST_EXCESS = 1.5
-"""Times as many false alarms as promised from which the promise is not kept."""
-
 CheckTraining: TypeAlias = Callable[[MonitorConfig, ProcessModel | None, TrainingRows, str], TrainingCheck]
 """Judges a training by itself, see `promise_check`."""
 
@@ -290,7 +282,7 @@ class PromiseStage:
         self.alarm_rates = rates
         rows = false_alarm_budget.DAYS_MIN / period_min
         mean, upper = rows * mean_rate, rows * float(np.quantile(rates, QUANTILE))
-        check = TrainingCheck(excess=excess if excess > LEAST_EXCESS else 0.0)
+        check = TrainingCheck(excess=excess if excess > 1.5 else 0.0)
         before = self.promise
         counts = (0, 0, 0) if before is None else (before.found, before.events, before.last_row)
         self.promise = PlantPromise(mean, max(mean, upper), rows, check, *counts)

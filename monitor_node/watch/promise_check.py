@@ -29,9 +29,6 @@ from reactorwatch.errors import InputError
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.stored_state import copy_of
 
-EXPECTED = 3.0
-"""Alarms expected in the second half with the wider limits."""
-
 
 class _Trial(NamedTuple):
     """Second half of a training, as watched.
@@ -96,7 +93,8 @@ def check_training(
             return pipeline
 
         strict = _watch(start(settings), aligned[half:], units)
-        per_30_days = min(strict.promise.per_30_days * EXPECTED / strict.mean_count, LARGEST_FALSE_ALARMS)
+        # so that some alarms are expected with the wider limits
+        per_30_days = min(strict.promise.per_30_days * 3.0 / strict.mean_count, LARGEST_FALSE_ALARMS)
         wide = msgspec.structs.replace(settings, false_alarms_per_30_days=per_30_days)
         trials = (strict, _watch(start(wide), aligned[half:], units))
     except InputError:  # too few rows, no output that can be watched after half of them, or limits that no chart has

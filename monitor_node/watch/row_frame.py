@@ -35,9 +35,6 @@ _COLUMNS = SETTINGS + max(_SHEWHART, _EWMA, _CUSUM)
 Records: TypeAlias = NDArray[np.void]
 Words: TypeAlias = NDArray[np.int64]
 
-LAST_NS = 0
-"""Word of a plant's numbers that is the time of its newest row."""
-
 HEAD = np.dtype([("last_ns", "i8"), ("period_ns", "f8"), ("time_min", "f8")])
 """Time of the newest row; sampling period; time of the filter's newest row."""
 

@@ -22,7 +22,6 @@ from reactorwatch.runtime.acl import audit
 from reactorwatch.runtime.bus import MAX_BATCH, Bus, Node, Request
 from reactorwatch.runtime.reorder_buffer import Gap
 
-MAX_WAIT_S = 3600.0
 MAX_DRAIN_FACTOR = 10
 """Multiple of `drain_timeout_s` after which a node ends although messages still arrive."""
 MAX_INBOX_MESSAGES = 100_000
@@ -341,7 +340,7 @@ class EventLoop:
             self._on_backlog(self._inbox.has_backlog)
             self._publish(self._node.on_tick(self._clock.now_ns()))
         handled = 0
-        while handled < BATCH and (messages := self._handle_next(min(wait_s, MAX_WAIT_S))):
+        while handled < BATCH and (messages := self._handle_next(min(wait_s, 3600.0))):
             handled += messages
             wait_s = 0.0
 

@@ -52,7 +52,7 @@ def sources() -> list[Path]:
 
 @cache
 def files() -> frozenset[str]:
-    """Paths, and their ends: `monitor_node/fleet/monitor.py`, `fleet/monitor.py` and `monitor.py`."""
+    """Paths, and their ends: `monitor_node/fleet.py`, `monitor_node/fleet.py` and `monitor.py`."""
     paths = [path for folder in FOLDERS for path in (ROOT / folder).rglob("*")]
     parts = [path.relative_to(ROOT).parts for path in (*ROOT.iterdir(), *paths)]
     return frozenset("/".join(part[start:]) for part in parts for start in range(len(part)))

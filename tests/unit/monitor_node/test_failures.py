@@ -10,7 +10,7 @@ from monitor_node.causes.isolation import Isolation, causes_of
 from monitor_node.causes.scan import Scan, scan_candidates
 from monitor_node.causes.window import Window
 from monitor_node.charts.charts import ChartWatch
-from monitor_node.checks.silence import SilenceCheck
+from monitor_node.checks.signal_checks import SilenceCheck
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from monitor_node.health import Failures

@@ -10,10 +10,10 @@ from monitor_node import __main__ as monitor_main
 from monitor_node.causes import stage
 from monitor_node.causes.isolation import LOOK_STEPS, LOOK_STEPS_A_ROW, Isolation
 from monitor_node.causes.window import MOST_PIECES, Row, newest_rows
-from monitor_node.charts import drift
+from monitor_node.charts import shift_and_drift as drift
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
-from monitor_node.fleet.config import FleetConfig
+from monitor_node.fleet import FleetConfig
 from monitor_node.node import MonitorNode
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
@@ -125,7 +125,7 @@ def test_an_error_in_what_is_prepared_is_left_to_the_first_look(monkeypatch: pyt
     def fail(_: object) -> None:
         raise RuntimeError("made on purpose")
 
-    monkeypatch.setattr("monitor_node.causes.fit.Fitter._prepare", fail)
+    monkeypatch.setattr("monitor_node.causes.isolation.Fitter._prepare", fail)
     assert len(list(stage.preparation(CONFIG, cstr()))) == 2
     monkeypatch.setattr("monitor_node.causes.isolation.GlrScan", fail)
     assert list(stage.preparation(CONFIG, cstr())) == []

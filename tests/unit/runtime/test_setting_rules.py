@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from diagnosis_node.trigger import DiagnosisConfig
 from monitor_node.config import MonitorConfig
-from monitor_node.fleet.config import FleetConfig
+from monitor_node.fleet import FleetConfig
 from plant_node.config import PlantConfig
 from reactorwatch.cli.up import diagnosis_settings
 from reactorwatch.errors import InputError

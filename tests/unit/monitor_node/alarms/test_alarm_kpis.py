@@ -1,6 +1,6 @@
 """The figures of EEMUA 191, against cases counted by hand."""
 
-from monitor_node.alarms.incidents import is_empty
+from monitor_node.alarms.alarms import is_empty
 from reactorwatch.contract.alarm_states import Event
 from reactorwatch.contract.messages_pb2 import AlarmKpis, Priority, PriorityCount
 from reactorwatch.records.record import to_time_ns

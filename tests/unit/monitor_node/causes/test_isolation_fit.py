@@ -5,8 +5,7 @@ from math import sqrt
 import numpy as np
 import pytest
 
-from monitor_node.causes.fit import Fitter
-from monitor_node.causes.isolation import causes_of
+from monitor_node.causes.isolation import Fitter, causes_of
 from monitor_node.causes.scan import Candidate, GlrScan, scan_candidates
 from monitor_node.causes.window import Window, window_of
 from reactorwatch.diagnosis.fitting.profiles import EndedRamp, FittedProfile, Ramp, Step

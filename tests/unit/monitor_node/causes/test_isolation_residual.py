@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from monitor_node.causes.fit import log_evidence_of_residual
+from monitor_node.causes.isolation import log_evidence_of_residual
 from reactorwatch.arrays import Array
 
 ROWS = 1300

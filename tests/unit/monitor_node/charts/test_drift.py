@@ -3,7 +3,7 @@
 import pytest
 
 from monitor_node.alarms.annunciator import Annunciator
-from monitor_node.charts import drift
+from monitor_node.charts import shift_and_drift as drift
 from monitor_node.config import MonitorConfig, ReferenceName
 from monitor_node.learn.arx import JUDGING_FORGETTING, arx_structure
 from reactorwatch.spc.charts.parameters import adaptive_weight, parameter_limit

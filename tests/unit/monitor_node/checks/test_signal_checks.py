@@ -10,8 +10,8 @@ from monitor_node.checks.base import CheckRow, CheckTraining
 from monitor_node.checks.stage import SignalChecks
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
-from monitor_node.learn.signal_range import ANY
 from monitor_node.watch.row_step import types_of
+from monitor_node.watched_process import ANY
 from reactorwatch.contract.messages_pb2 import Alarm
 from reactorwatch.stored_state import Memory, copy_of
 

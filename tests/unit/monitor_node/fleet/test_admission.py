@@ -1,6 +1,6 @@
 """Invented names of plants cost a fleet little, and are evicted."""
 
-from monitor_node.fleet.config import Shard, shard_of
+from monitor_node.fleet import Shard, shard_of
 from reactorwatch.contract.codec import Encoded
 
 from ..fleets import SECOND_NS, fleet, run_of

@@ -5,7 +5,7 @@ import pytest
 
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
-from monitor_node.fleet.monitor import FleetMonitor
+from monitor_node.fleet import FleetMonitor
 from monitor_node.learn.training_diagnosis import FAILED, DiagnosisJob, Finding
 from reactorwatch.contract.codec import Encoded, Publication
 from reactorwatch.contract.messages_pb2 import Sample

@@ -3,7 +3,7 @@
 import pytest
 
 from monitor_node.config import MonitorConfig
-from monitor_node.fleet.config import Shard, shard_of
+from monitor_node.fleet import Shard, shard_of
 from reactorwatch.contract.codec import Encoded, Publication, encode_message
 from reactorwatch.contract.messages_pb2 import Alarm, AlarmCommand, CommandReply, Health
 from reactorwatch.errors import InputError

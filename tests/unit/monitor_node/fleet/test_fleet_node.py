@@ -8,10 +8,9 @@ import pytest
 
 from monitor_node.alarms.commands import PER_NAME
 from monitor_node.core import Monitor
-from monitor_node.fleet.config import FleetConfig
-from monitor_node.fleet.monitor import EVICT_NS
+from monitor_node.fleet import EVICT_NS, FleetConfig
 from monitor_node.node import POLL_NS, MonitorNode
-from monitor_node.storage.state_files import CLAIM
+from monitor_node.state_files import CLAIM
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication, encode_message
 from reactorwatch.contract.messages_pb2 import Alarm, AlarmCommand, AlarmKpis

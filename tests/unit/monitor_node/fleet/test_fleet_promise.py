@@ -4,7 +4,7 @@ import pytest
 from structlog.testing import capture_logs
 
 from monitor_node.config import MonitorConfig
-from monitor_node.fleet.config import FleetConfig
+from monitor_node.fleet import FleetConfig
 from monitor_node.node import MonitorNode
 from reactorwatch.errors import InputError
 from reactorwatch.runtime.config import section

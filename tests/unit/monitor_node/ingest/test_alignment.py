@@ -5,8 +5,7 @@ import random
 
 import pytest
 
-from monitor_node.ingest.alignment import Aligner
-from monitor_node.ingest.rows import Row
+from monitor_node.ingest.rows import Aligner, Row
 
 SIGNALS = ("qc", "C", "T")
 PERIOD = 100

@@ -1,7 +1,6 @@
 """The filter of samples that were processed before a restart."""
 
-from monitor_node.ingest.alignment import Aligner
-from monitor_node.ingest.duplicates import ReplayFilter
+from monitor_node.ingest.rows import Aligner, ReplayFilter
 
 
 def test_the_filter_is_over_once_each_signal_has_passed_what_the_state_has() -> None:

@@ -12,9 +12,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from monitor_node.config import MonitorConfig
-from monitor_node.fleet.config import FleetConfig
+from monitor_node.fleet import FleetConfig
 from monitor_node.node import MonitorNode
-from monitor_node.storage.state_files import CLAIM, StateStore, find_kept_aside, keep_aside
+from monitor_node.state_files import CLAIM, StateStore, find_kept_aside, keep_aside
 from reactorwatch.contract.codec import Encoded
 from reactorwatch.contract.messages_pb2 import Alarm, AlarmState
 from reactorwatch.errors import InputError

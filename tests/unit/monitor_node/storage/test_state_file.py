@@ -9,7 +9,7 @@ import pytest
 
 from monitor_node.config import MonitorConfig
 from monitor_node.node import MonitorNode
-from monitor_node.storage.state_files import CLAIM
+from monitor_node.state_files import CLAIM
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, encode, encode_message
 from reactorwatch.contract.messages_pb2 import Baseline, BaselineCommand, Health, ListAlarms

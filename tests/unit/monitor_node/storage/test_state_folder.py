@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from monitor_node.storage.state_files import CLAIM, StateStore
+from monitor_node.state_files import CLAIM, StateStore
 from reactorwatch.errors import InputError
 
 
