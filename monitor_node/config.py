@@ -12,8 +12,8 @@ from reactorwatch.description.find import find_process
 from reactorwatch.runtime.config import check_bounds
 from reactorwatch.spc.charts.base import Setting, SignalSetting
 from reactorwatch.spc.charts.catalogue import CHARTS, chart
+from reactorwatch.spc.charts.value_chart import FEWEST_SIGNALS, ValueChart
 from reactorwatch.spc.run_length import check_rule
-from reactorwatch.spc.value_chart import FEWEST_SIGNALS, ValueChart
 
 CHART_SETTINGS = [setting for chart in CHARTS for setting in chart.settings if isinstance(setting, Setting)]
 CHART_SIGNALS = [setting for chart in CHARTS for setting in chart.settings if isinstance(setting, SignalSetting)]

@@ -26,9 +26,9 @@ from reactorwatch.contract.messages_pb2 import ChartPoint
 from reactorwatch.spc.charts.base import Chart, JointChart, Judgement, Shown, SignalChart
 from reactorwatch.spc.charts.catalogue import chart
 from reactorwatch.spc.charts.shewhart import designed_width
+from reactorwatch.spc.charts.value_chart import ValueChart
 from reactorwatch.spc.compiled_chart import Bank, CompiledChart, SignalMemory
 from reactorwatch.spc.prewhitening import Prewhitening
-from reactorwatch.spc.value_chart import ValueChart
 from reactorwatch.stored_state import Memory, read_memory
 
 SD = "sd"

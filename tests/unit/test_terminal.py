@@ -26,7 +26,7 @@ from recorder.files.writer import RecordingWriter
 
 ROOT = Path(__file__).parents[2]
 HOSTILE = "\x1b[2J\x1b]0;title\x07 a\r\nb\tc\x7f\x9b31m\u202eevil\u2066\u200b\u2028\u2029\ufeff\U000e0041"
-BORDER = {"crash.py", "display.py", "replay.py"}
+BORDER = {"node_main.py", "display.py", "replay.py"}
 
 
 def acted_on(text: str) -> list[str]:

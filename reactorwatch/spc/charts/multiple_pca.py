@@ -20,8 +20,8 @@ from scipy import special
 
 from reactorwatch.arrays import Array
 from reactorwatch.spc.charts.base import Setting
-from reactorwatch.spc.statistics_chart import Components, Model, StatisticsChart, components_of, parts_of, standardise
-from reactorwatch.spc.value_chart import ValueBaseline
+from reactorwatch.spc.charts.pca import Components, standardise
+from reactorwatch.spc.charts.value_chart import Model, StatisticsChart, ValueBaseline
 
 RIDGE = 1e-3
 """Share of the variance of all rows that each regime has at least, in every direction."""
@@ -157,7 +157,10 @@ class MultiplePca(StatisticsChart):
         z = (window[-1] - model["centre"]) / model["scale"]
         memberships = memberships_of(model, z)
         regimes = zip(model["centres"], model["loadings"], model["variances"], model["rests"], strict=True)
-        parts = [m * parts_of(z - mean, *rest) for m, (mean, *rest) in zip(memberships, regimes, strict=True)]
+        parts = [
+            m * Components(loadings, loadings, *rest).relative_parts(z - mean)
+            for m, (mean, loadings, *rest) in zip(memberships, regimes, strict=True)
+        ]
         return np.asarray(sum(parts))
 
     def explain(self) -> tuple[str, dict[str, float]]:
@@ -178,4 +181,4 @@ def weighted_components(z: Array, weights: Array) -> tuple[Array, Components]:
     """Mean and components of rows with weights, shapes (rows, signals) and (rows,)."""
     mean = weights @ z / weights.sum()
     off = z - mean
-    return mean, components_of((off * weights[:, None]).T @ off / weights.sum())
+    return mean, Components.principal((off * weights[:, None]).T @ off / weights.sum())

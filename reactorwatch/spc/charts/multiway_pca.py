@@ -15,8 +15,8 @@ import numpy as np
 
 from reactorwatch.arrays import Array
 from reactorwatch.spc.charts.base import Setting, SignalSetting
-from reactorwatch.spc.statistics_chart import Model, StatisticsChart, components_of, parts_of
-from reactorwatch.spc.value_chart import BLOCKS, ValueBaseline
+from reactorwatch.spc.charts.pca import Components
+from reactorwatch.spc.charts.value_chart import BLOCKS, Model, StatisticsChart, ValueBaseline
 
 STAGES = 20
 """Number of intervals of a batch; courses are linear within one."""
@@ -72,13 +72,8 @@ class MultiwayPca(StatisticsChart):
         squares = smooth_courses(basis, (x - basis @ means) ** 2)
         sds = np.sqrt(np.maximum(squares, (LEAST_SD * np.where(total > 0.0, total, 1.0)) ** 2))
         z = (x - basis @ means) / (basis @ sds)
-        components = components_of(z.T @ z / len(z))
         courses = {"is_progress": is_progress.astype(np.float64), "nodes": nodes, "courses": means, "course_sds": sds}
-        return courses | {
-            "loadings": components.loadings,
-            "variances": components.variances,
-            "rest": np.array([components.rest]),
-        }
+        return courses | Components.principal(z.T @ z / len(z))._asdict()
 
     @classmethod
     def parts(cls, model: Model, window: Array) -> Array:
@@ -92,7 +87,7 @@ class MultiwayPca(StatisticsChart):
         )
         z = (window[-1][~is_progress] - mean) / sd
         parts = np.zeros((2, is_progress.size))
-        parts[:, ~is_progress] = parts_of(z, model["loadings"], model["variances"], float(model["rest"][0]))
+        parts[:, ~is_progress] = Components.of(model).relative_parts(z)
         return parts
 
     def fill(self, x: Array) -> Array | None:

@@ -20,8 +20,8 @@ import numpy as np
 
 from reactorwatch.arrays import Array
 from reactorwatch.spc.charts.base import Setting, SignalSetting
-from reactorwatch.spc.statistics_chart import Model, StatisticsChart, standardise
-from reactorwatch.spc.value_chart import BLOCKS, ValueBaseline
+from reactorwatch.spc.charts.pca import Components, standardise
+from reactorwatch.spc.charts.value_chart import BLOCKS, Model, StatisticsChart, ValueBaseline
 
 MOST_COMPONENTS = 8
 """Largest number of components; there is always one less than signals, so that something is left for SPE."""
@@ -107,10 +107,8 @@ class Pls(StatisticsChart):
         """See `StatisticsChart`; quality variables have none."""
         is_x = model["is_quality"] == 0.0
         off = ((window[-1] - model["centre"]) / model["scale"])[is_x]
-        scores = off @ model["rotations"]
         parts = np.zeros((2, is_x.size))
-        parts[0, is_x] = off * (model["rotations"] @ (scores / model["variances"])) / scores.size
-        parts[1, is_x] = (off - model["loadings"] @ scores) ** 2 / model["rest"][0]
+        parts[:, is_x] = Components.of(model).relative_parts(off)
         return parts
 
     def explain(self) -> tuple[str, dict[str, float]]:

@@ -40,8 +40,7 @@ from reactorwatch.codegen.numba_kernel import Entry, jit
 from reactorwatch.errors import InputError, positive
 from reactorwatch.spc.charts.base import LARGEST_VALUE, Judgement, Setting, vector
 from reactorwatch.spc.charts.ewma import ewma_limit
-from reactorwatch.spc.false_alarm_budget import TrainingErrors, student_tail
-from reactorwatch.spc.value_chart import (
+from reactorwatch.spc.charts.value_chart import (
     BLOCKS,
     NAMED,
     ValueBaseline,
@@ -51,6 +50,7 @@ from reactorwatch.spc.value_chart import (
     fill_missing,
     student_limit,
 )
+from reactorwatch.spc.false_alarm_budget import TrainingErrors, student_tail
 from reactorwatch.stored_state import Memory
 
 
