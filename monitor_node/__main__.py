@@ -96,14 +96,7 @@ def run(
 
 
 def watch(node: MonitorNode, bus: Bus, stop: StopSignal, history_s: float = 0.0) -> None:
-    """Run a monitor until it is asked to stop.
-
-    Args:
-        node: the monitor.
-        bus: an open bus.
-        stop: ends it.
-        history_s: age of the oldest earlier sample to receive.
-    """
+    """Run a monitor until it is asked to stop."""
     log.info("listening", plants=node.expression)
     loop = EventLoop(
         node,

@@ -40,9 +40,6 @@ class DiagnosisWorker:
 
     A diagnosis at which two processes die has failed. An unfinished diagnosis is dropped when the program ends; the
     training's rows are still in the plant's state.
-
-    Args:
-        executor: runs the jobs; None: a process of this machine.
     """
 
     def __init__(self, executor: Executor | None = None) -> None:

@@ -80,10 +80,6 @@ def shard_of(plant: str, of: int) -> int:
 
     >>> [shard_of(plant, 3) for plant in ("a", "b", "c", "d")]
     [3, 3, 1, 3]
-
-    Args:
-        plant: name of the plant.
-        of: number of shards.
     """
     return int.from_bytes(blake2b(plant.encode(), digest_size=8).digest(), "big") % of + 1
 
@@ -181,10 +177,6 @@ class PlantKind(NamedTuple):
 def load_kinds(config: MonitorConfig, fleet: FleetConfig) -> tuple[PlantKind, ...]:
     """Kinds of plants in a fleet; the last one has the pattern `ANY` and the process of the monitor's settings.
 
-    Args:
-        config: settings of each plant's monitor.
-        fleet: settings of the fleet.
-
     Raises:
         InputError: a process cannot be loaded, or does not fit the settings of the monitor.
     """
@@ -198,10 +190,6 @@ def load_kinds(config: MonitorConfig, fleet: FleetConfig) -> tuple[PlantKind, ..
 
 def prepare(kinds: Sequence[PlantKind], *, points: bool) -> None:
     """Compile the machine code of the first use, which takes ten seconds and more on a new machine.
-
-    Args:
-        kinds: kinds of plants.
-        points: see `Monitor`.
 
     Raises:
         InputError: the settings are inconsistent.

@@ -76,11 +76,6 @@ class Failures:
     def add(self, stage: str, error: Exception, cost: str) -> None:
         """Count an exception, and report it if it is the first from its line of code.
 
-        Args:
-            stage: the part of the work that failed.
-            error: the exception.
-            cost: consequence for the plant, as the end of a sentence.
-
         Raises:
             Exception: the exception, if it passes.
         """
@@ -130,10 +125,6 @@ class OtherMonitors:
 
     Two monitors of one plant raise every alarm twice, and both answer commands. Each group is logged once, with the
     first shared plant, and once more when its last monitor has gone.
-
-    Args:
-        own: liveliness token of this monitor.
-        plants: returns the plants of this monitor.
     """
 
     def __init__(self, own: str, plants: Callable[[], Collection[str]]) -> None:

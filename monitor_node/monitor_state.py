@@ -81,12 +81,7 @@ TRAINING = ("training_min", "training_rows")
 
 
 class OtherSettingsError(InputError):
-    """The state is intact, but was learned with other settings; its alarms can be used.
-
-    Args:
-        text: the difference.
-        alarms: memory of the alarms.
-    """
+    """The state is intact, but was learned with other settings; its alarms can be used."""
 
     def __init__(self, text: str, alarms: AnnunciatorMemory) -> None:
         super().__init__(text)
@@ -136,13 +131,7 @@ class MonitorState(MonitorMemory, kw_only=True):
 
 
 def learning_settings(config: MonitorConfig, model: ProcessModel | None, *, points: bool) -> dict[str, Any]:
-    """Settings that must be equal to resume from a state.
-
-    Args:
-        config: settings of the monitor.
-        model: process model.
-        points: see `Monitor`.
-    """
+    """Settings that must be equal to resume from a state."""
     fields = {field: value for field, value in msgspec.structs.asdict(config).items() if field not in NOT_LEARNED_BY}
     for name in TRAINING:
         if fields[name] is None:
@@ -161,10 +150,6 @@ def seal_state(state: MonitorState, settings: dict[str, Any]) -> bytes:
 
 def open_state(data: bytes, settings: dict[str, Any]) -> MonitorState:
     """Open a sealed state.
-
-    Args:
-        data: bytes from `seal_state`.
-        settings: see `learning_settings`.
 
     Raises:
         ForeignFileError: the bytes were never a state, or are one of another plant.

@@ -152,11 +152,6 @@ RESUMED = "the monitor resumes from it"
 def restore(path: Path, monitor: Monitor, asides: Iterable[Path]) -> str:
     """Restore a monitor from its file, or from one that was kept aside and fits now; returns a text for the log.
 
-    Args:
-        path: the file.
-        monitor: the monitor.
-        asides: files that were kept aside.
-
     Raises:
         ForeignFileError: the file is no state; it is left as it is.
         InputError: the file can hold no state.

@@ -144,13 +144,7 @@ def order_inputs(config: MonitorConfig, model: ProcessModel | None) -> MonitorCo
 
 
 def limit_training(config: MonitorConfig, rows: int | None, *, is_stated: bool | None = None) -> MonitorConfig:
-    """Limit a training that is not stated to a third of a record; that of the reactor stays as it is.
-
-    Args:
-        config: settings of a monitor.
-        rows: number of rows of the record; None: unknown.
-        is_stated: True if the length is stated; None: as the settings say.
-    """
+    """Limit a training that is not stated to a third of a record; that of the reactor stays as it is."""
     stated = _states_training(config) if is_stated is None else is_stated
     length = config.training_length
     if stated or rows is None or length.minutes is not None:
@@ -186,12 +180,7 @@ ANY = SignalRange()
 
 
 def signal_ranges(model: ProcessModel | None, signals: tuple[str, ...]) -> list[SignalRange]:
-    """Range of each signal.
-
-    Args:
-        model: model of the plant; None: ranges are unbounded.
-        signals: names of the signals. An output that is not a state is unbounded.
-    """
+    """Range of each signal."""
     if model is None:
         return [ANY] * len(signals)
     states = {state.name: state for state in model.states}
@@ -214,12 +203,7 @@ def stated_ranges(config: MonitorConfig) -> list[SignalRange]:
 
 
 def possible_ranges(config: MonitorConfig, model: ProcessModel | None) -> list[SignalRange]:
-    """Range of each signal of a row: as stated, and within that of the model.
-
-    Args:
-        config: settings of the monitor.
-        model: model of the plant; None: ranges are as stated.
-    """
+    """Range of each signal of a row: as stated, and within that of the model."""
     pairs = zip(stated_ranges(config), signal_ranges(model, config.signals), strict=True)
     return [
         SignalRange(max(stated.lower, given.lower), min(stated.upper, given.upper), given.unit or stated.unit)

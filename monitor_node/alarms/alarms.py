@@ -100,16 +100,7 @@ def raises(recent: int, raise_count: int, violating: bool) -> bool:
 
 @jit
 def is_ordinary(statistic: float, centre: float, lower: float, upper: float, above: bool, reach: float) -> bool:
-    """True if a point is within the limit that was crossed, by the dead band.
-
-    Args:
-        statistic: statistic of the point.
-        centre: centre of the chart.
-        lower: lower limit.
-        upper: upper limit.
-        above: True if the upper limit was crossed.
-        reach: share of the way from the centre to the limit that is ordinary.
-    """
+    """True if a point is within the limit that was crossed, by the dead band."""
     deviation = statistic - centre
     return deviation <= reach * (upper - centre) if above else deviation >= reach * (lower - centre)
 
@@ -299,11 +290,7 @@ class Incident(msgspec.Struct, forbid_unknown_fields=True):
     published: bytes = b""
 
     def message(self, members: Collection[AlarmMemory]) -> IncidentMessage:
-        """The incident as a message, without the time.
-
-        Args:
-            members: memory of the alarms whose last activation belongs to the incident.
-        """
+        """The incident as a message, without the time."""
         return IncidentMessage(
             number=self.number,
             since_ns=self.since_ns,
@@ -340,13 +327,7 @@ class KpiCounter(Memory):
     raised: dict[int, Count] = msgspec.field(default_factory=dict)
 
     def compute(self, time_ns: int, alarms: Collection[ChartAlarm], incidents: int) -> AlarmKpis:
-        """Compute the KPIs.
-
-        Args:
-            time_ns: present plant time.
-            alarms: all alarms of the plant.
-            incidents: number of incidents so far.
-        """
+        """Compute the KPIs."""
         # Those in the future are from before the clock was set back.
         recent = self.recent = [item for item in self.recent if 0 <= time_ns - item.time_ns < 10 * MINUTE_NS]
         abnormal = [alarm for alarm in alarms if alarm.memory.state is not State.NORMAL]  # few of hundreds

@@ -141,11 +141,6 @@ LEAST_ROWS = 100
 class Isolation:
     """Compares all causes on rows of one plant.
 
-    Args:
-        model: process model of the plant.
-        noise: noise levels of the plant and its sensors.
-        usual_rows: usual number of rows of a look, which its budget depends on.
-
     Attributes:
         steps: number of filter steps that a look may take.
         fitter: fits causes to the rows; its progress with a large fault is that of earlier looks.
@@ -215,11 +210,6 @@ _HOLDS, _NOISE, _KEPT = 0.05, 5.0, 0.5
 class Fitter:
     """Fits all causes, each as a step and as a ramp.
 
-    Args:
-        model: process model of the plant.
-        noise: noise levels of the plant and its sensors.
-        effects: effects of the causes, in the order of the scan.
-
     Attributes:
         progress: how far a large fault was followed; None without one.
     """
@@ -246,12 +236,6 @@ class Fitter:
 
     def fit(self, window: Window, early: Scan, full: Scan, budget: StepBudget | None = None) -> list[Candidate]:
         """Fit the plausible causes; return them best first, followed for a small fault by those not fitted.
-
-        Args:
-            window: the rows.
-            early: scan of the rows up to the first in which a cause stands out.
-            full: scan of all rows.
-            budget: budget of filter steps; None: unlimited.
 
         Raises:
             BudgetExceededError: the budget is spent. The progress with a large fault is kept.
@@ -334,15 +318,7 @@ class Fitter:
 
 
 class _Segment:
-    """Rows of a window on which hypotheses are compared.
-
-    Args:
-        fitter: fitter of the hypotheses.
-        window: the window.
-        begin: index of the first row.
-        end: index after the last row.
-        without_fault: the filter's run over the whole window without a fault.
-    """
+    """Rows of a window on which hypotheses are compared."""
 
     def __init__(self, fitter: Fitter, window: Window, begin: int, end: int, without_fault: FilterResult) -> None:
         part, missing = slice(begin, end), window.missing
@@ -445,10 +421,6 @@ def log_evidence_of_residual(w: Array, measured: NDArray[np.bool_]) -> float:
     """Logarithm of the evidence that innovations are larger than noise by a factor, over that of noise.
 
     The variance of each sensor's noise is fitted to the rows, within the error of the training.
-
-    Args:
-        w: normalised innovations, shape (rows, n_y); 0 where not measured.
-        measured: mask of measured values, shape (rows, n_y).
     """
     clipped, blocks = np.clip(w, -HUBER, HUBER), list[tuple[Array, NDArray[np.int_]]]()
     for rows in SUMMED_ROWS:

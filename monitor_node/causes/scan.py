@@ -58,13 +58,7 @@ class Scan:
 
 
 class GlrScan:
-    """Scans windows of one plant.
-
-    Args:
-        model: process model of the plant.
-        noise: noise levels of the plant and its sensors.
-        effects: effects of the causes; none may add states.
-    """
+    """Scans windows of one plant."""
 
     def __init__(self, model: ProcessModel, noise: NoiseLevels, effects: Sequence[Effect]) -> None:
         self._lower = np.array([effect.lower for effect in effects])

@@ -54,10 +54,6 @@ def preparation(config: MonitorConfig, model: ProcessModel | None) -> Iterator[N
     """Compile what the first look for causes would compile, one part for each item of the iterator.
 
     All parts take about a second of processor time, or ten if nothing is in the cache on the disk.
-
-    Args:
-        config: settings of the monitor.
-        model: process model of the plant; None without one.
     """
     if model is None or not has_causes(config, model):
         return
@@ -116,11 +112,6 @@ class Reconstruction:
     balances and the other sensors. It is not corrected by the size of its fault: that would be only as good as the
     known form of the fault, and this holds for a sensor that drifts, sticks or fails in any other way. It costs some
     accuracy.
-
-    Args:
-        model: process model of the plant.
-        noise: noise levels of the plant and its sensors.
-        memory: the sensor, and the memory of an earlier reconstruction of it.
     """
 
     def __init__(self, model: ProcessModel, noise: NoiseLevels, memory: ReconstructionMemory) -> None:
@@ -146,11 +137,6 @@ class Reconstruction:
         """Process a row and return the true reading without noise and its standard deviation, in the output's unit.
 
         Both are NaN in the row with which the filter starts.
-
-        Args:
-            time_min: time of the row.
-            inputs: one value an input; NaN if missing: the last known one then holds.
-            measured: values of all sensors; NaN where missing.
         """
         return self._step(time_min, inputs, measured, is_right=False)
 
@@ -172,12 +158,6 @@ class Reconstruction:
 
 class Suspicion:
     """Searches the causes of one plant's alarms.
-
-    Args:
-        config: settings of the monitor.
-        board: annunciator of the plant.
-        reference: equations by which the rows are predicted.
-        memory: memory of another search for the same plant, from which this one resumes; None: it starts.
 
     Raises:
         ValueError: the memory is damaged.
@@ -207,15 +187,7 @@ class Suspicion:
     def update(
         self, time_ns: int, inputs: Sequence[float], values: list[float], units: list[str], stuck: list[bool]
     ) -> list[Publication]:
-        """Process a row after its alarms.
-
-        Args:
-            time_ns: time of the row.
-            inputs: one value an input; NaN if missing.
-            values: outputs; NaN where missing.
-            units: units of the outputs.
-            stuck: flags of the outputs whose sensors are stuck; their values are missing.
-        """
+        """Process a row after its alarms; values of stuck sensors are missing."""
         time_min, since = time_ns / MINUTE_NS, self.memory.since
         publications: list[Publication] = []
         rows = self.memory.rows

@@ -192,12 +192,7 @@ def _run_filter(
 
 
 def newest_rows(rows: Sequence[Row], least: int = 0) -> Sequence[Row]:
-    """Select the newest rows whose intervals have at most `MOST_PIECES` additional pieces.
-
-    Args:
-        rows: rows, oldest first.
-        least: number of rows to keep in any case.
-    """
+    """Select the newest rows whose intervals have at most `MOST_PIECES` additional pieces."""
     apart = np.diff([row[0] for row in rows])
     pieces = np.where((apart > 0.0) & (apart <= LONGEST_GAP_MIN), np.ceil(apart / LONGEST_ROW_MIN) - 1.0, 0.0)
     before = int(np.searchsorted(np.cumsum(pieces[::-1]), MOST_PIECES, side="right")) + 1

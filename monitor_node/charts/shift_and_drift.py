@@ -42,12 +42,7 @@ STAYED = "stayed there, which the model follows from then on"
 
 
 class ShiftWatch:
-    """Tests the outputs of a plant for lasting steps.
-
-    Args:
-        config: settings of the monitor.
-        board: alarms of the plant; those of the tests are declared here.
-    """
+    """Tests the outputs of a plant for lasting steps."""
 
     def __init__(self, config: MonitorConfig, board: Annunciator) -> None:
         self._outputs, self._board = config.outputs, board
@@ -98,13 +93,7 @@ class ShiftWatch:
             self._tests.restart()
 
     def update(self, row: MeasuredRow, z: list[float], *, points: bool) -> list[AlarmChange]:
-        """Test a row; returns the changes of alarms.
-
-        Args:
-            row: the row; points are added to its publications.
-            z: residual of each output, normalised by the reference; NaN where there is none.
-            points: True to publish the points.
-        """
+        """Test a row; returns the changes of alarms."""
         changes: list[AlarmChange] = []
         if self._tests is None:
             return changes
@@ -134,12 +123,7 @@ ROWS = 50
 
 
 def preparation(config: MonitorConfig, *, wanted: bool) -> Iterator[None]:
-    """Compute what the limits take seconds for, step by step, so that no row waits for it at the end of the training.
-
-    Args:
-        config: settings of the monitor.
-        wanted: the drift is published; without, it has limits only where it raises an alarm.
-    """
+    """Compute what the limits take seconds for, step by step: no row waits for it at the end of the training."""
     if not (wanted or ParameterT2.name in config.charts):
         return
     memory, judging = config.forgetting, max(config.forgetting, JUDGING_FORGETTING)
@@ -150,13 +134,7 @@ def preparation(config: MonitorConfig, *, wanted: bool) -> Iterator[None]:
 
 
 class DriftWatch:
-    """Compares the models of a plant.
-
-    Args:
-        config: configuration of the monitor.
-        board: the alarms of the plant; those of the drift, if wanted, are declared here.
-        publish: whether the drift is to be published.
-    """
+    """Compares the models of a plant."""
 
     def __init__(self, config: MonitorConfig, board: Annunciator, *, publish: bool) -> None:
         self._outputs = config.outputs
@@ -183,11 +161,7 @@ class DriftWatch:
         """True if the models have to adapt at all."""
 
     def chance_alarms(self, evaluated: list[bool]) -> int:
-        """Number of its alarms that chance can raise.
-
-        Args:
-            evaluated: for each output, True if it is evaluated.
-        """
+        """Number of its alarms that chance can raise."""
         return sum(evaluated) if self._alarms else 0
 
     def start(self, predictors: list[ArxPredictor], evaluated: list[bool], arl0: float) -> list[str]:
@@ -210,12 +184,7 @@ class DriftWatch:
         return notes
 
     def update(self, row: MeasuredRow, predictors: list[ArxPredictor]) -> list[AlarmChange]:
-        """Evaluate the drift, if it is time; returns the changes of alarms.
-
-        Args:
-            row: the row; points are added to its publications.
-            predictors: the predictors given to `start`.
-        """
+        """Evaluate the drift, if it is time; returns the changes of alarms."""
         changes: list[AlarmChange] = []
         if not self.wanted:
             return changes

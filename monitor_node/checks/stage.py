@@ -28,12 +28,6 @@ CHECKS: tuple[type[SignalCheck], ...] = (SilenceCheck, StuckCheck, SpikeCheck, R
 class SignalChecks:
     """Checks the signals of one plant.
 
-    Args:
-        config: configuration of the monitor.
-        board: the alarms of the plant; those of the signals are declared here.
-        ranges: ranges of each input and of each output.
-        numbers: numbers of the plant's stages, shape (1,), see `row_frame.FrameTypes`.
-
     Attributes:
         silence: the check for missing data, which a receive time can decide as well.
     """
@@ -80,14 +74,7 @@ class SignalChecks:
     def relative_rates(
         self, learned: Sequence[Prewhitening], evaluated: Sequence[bool], arl0: float, errors: TrainingErrors
     ) -> Array:
-        """Rate of all false alarms by the errors of the training, in shares of one alarm, shape (draws,).
-
-        Args:
-            learned: prewhitening of each output.
-            evaluated: for each output, True if it is evaluated.
-            arl0: run length of each alarm without a fault, in rows.
-            errors: errors of all outputs.
-        """
+        """Rate of all false alarms by the errors of the training, in shares of one alarm, shape (draws,)."""
         of_checks = (check.relative_rates(learned, arl0, errors) for check in self._checks if check.can_be_false)
         return sum((rates[:, list(evaluated)].sum(axis=1) for rates in of_checks), np.zeros(len(errors.mean)))
 
@@ -121,13 +108,7 @@ class SignalChecks:
     # --- rows ------------------------------------------------------------------------------------------------
 
     def update(self, judged: Judged, row: CheckRow, changes: list[AlarmChange]) -> list[bool]:
-        """Check a row by each check of these values; returns a flag for each that is no measurement.
-
-        Args:
-            judged: the values of the row.
-            row: the row.
-            changes: list to which changes of alarms are added.
-        """
+        """Check a row by each check of these values; returns a flag for each that is no measurement."""
         flags = [False] * len(row.values)
         for check in self._checks:
             if check.judged != judged:

@@ -43,10 +43,6 @@ def reject_reason(signal: str, sample: Sample) -> tuple[str, str]:
 class SampleUnits:
     """Converts the samples of a plant; those of signals without a unit here are judged in the units that they come in.
 
-    Args:
-        declared: units of the signals as their process describes them.
-        model_units: units of the equations.
-
     Attributes:
         plain: newest unit by signal that needed no conversion.
     """
@@ -58,11 +54,6 @@ class SampleUnits:
 
     def convert(self, signal: str, unit: str, value: float) -> tuple[float, str]:
         """Value and unit of a sample.
-
-        Args:
-            signal: name of the signal.
-            unit: unit that the sample names; empty: none.
-            value: value in that unit.
 
         Raises:
             InputError: the unit is unknown, or measures another quantity.
@@ -226,12 +217,7 @@ class SampleIntake:
         return self._replay_filter is not None and not self._replay_filter.has_begun
 
     def take(self, messages: Sequence[Encoded], publications: list[Publication]) -> bool:
-        """Process messages on keys of the plant's samples; returns True if a sample was accepted.
-
-        Args:
-            messages: the messages, in order.
-            publications: list to which publications are added.
-        """
+        """Process messages on keys of the plant's samples; returns True if a sample was accepted."""
         is_accepted = False
         for key, payload, encoding, _ in messages:
             signal = self._signal_by_key.get(key)

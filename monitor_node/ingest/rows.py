@@ -148,11 +148,7 @@ def missing_rows(periods: float) -> int:
 
 
 def regular_intervals(time_min: Array) -> NDArray[np.bool_]:
-    """Flags of the intervals of a record that are one sampling period, its median interval, to a tenth; shape (n - 1,).
-
-    Args:
-        time_min: times of the rows, shape (n,).
-    """
+    """Flags of the intervals that are one sampling period, the median interval, to a tenth; shape (rows - 1,)."""
     spacings = np.diff(time_min)
     period = np.median(spacings) if spacings.size else 0.0
     return np.abs(spacings - period) <= TOLERANCE * period
@@ -160,9 +156,6 @@ def regular_intervals(time_min: Array) -> NDArray[np.bool_]:
 
 def missing_in_intervals(time_min: Array) -> NDArray[np.intp]:
     """Numbers of rows missing in the intervals of a record, by its median interval, shape (n - 1,).
-
-    Args:
-        time_min: times of the rows, shape (n,).
 
     >>> missing_in_intervals(np.array([0.0, 1.0, 2.0, 4.0, 5.0])).tolist()
     [0, 0, 1, 0]
@@ -240,9 +233,6 @@ class ReplayFilter:
     plant was restarted with its clock set back. A sample that is missing in its row of the state was not processed, and
     passes.
 
-    Args:
-        memory: memory of the alignment as stored.
-
     Attributes:
         has_begun: True if a sample has come.
     """
@@ -262,13 +252,7 @@ class ReplayFilter:
         return not self._unfinished
 
     def is_duplicate(self, index: int, time_ns: int, sequence: int) -> bool:
-        """True if a sample was processed before.
-
-        Args:
-            index: index of the signal in the rows.
-            time_ns: sample time.
-            sequence: sequence number.
-        """
+        """True if a sample was processed before."""
         self.has_begun = True
         newest = self._newest[index]
         if newest is None:
@@ -290,10 +274,6 @@ REMEMBERED = 4  # times the reordering: emitted rows kept to detect duplicates; 
 class Aligner:
     """Aligns samples to rows.
 
-    Args:
-        signals: names of the signals, in the order of the rows' values.
-        reorder_rows: number of newer rows that may start before an incomplete row is emitted.
-
     Raises:
         ValueError: `reorder_rows` is less than 1.
     """
@@ -308,14 +288,7 @@ class Aligner:
         self._start_run()
 
     def update(self, signal: str, time_ns: int, sequence: int, value: float) -> list[Row]:
-        """Add a sample; returns the rows that are ready, oldest first.
-
-        Args:
-            signal: one of the aligner's signals.
-            time_ns: sample time.
-            sequence: sequence number.
-            value: finite value.
-        """
+        """Add a sample; returns the rows that are ready, oldest first."""
         rows: list[Row] = []
         index, memory = self._index[signal], self.memory
         position = memory.sequences[index]

@@ -84,12 +84,7 @@ class SequenceCheck(GapTracker):
         return True
 
     def update(self, sample: HeldSample, reorder_rows: int) -> tuple[list[HeldSample], list[HeldSample]]:
-        """Update with a sample; returns accepted samples and rejected samples.
-
-        Args:
-            sample: the new sample.
-            reorder_rows: see the alignment.
-        """
+        """Update with a sample; returns accepted samples and rejected samples."""
         held, window = self.held, REMEMBERED * reorder_rows
         follows = self._follows(sample, window)
         if not held:

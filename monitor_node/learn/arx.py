@@ -109,10 +109,6 @@ class LaggedRows(Memory, dict=True):
         """Add a row; returns its regressor, shape (parameters,).
 
         None if it cannot be predicted, as there are too few complete rows just before it, or misses a value.
-
-        Args:
-            inputs: one value an input; NaN if missing.
-            output: value of the output; NaN if missing.
         """
         if not (isfinite(output) and all(map(isfinite, inputs))):
             self.restart()
@@ -173,12 +169,7 @@ class ArxPredictor(Memory, dict=True):
 
     @classmethod
     def of(cls, structure: Structure, forgetting: float) -> Self:
-        """Predictor that knows nothing.
-
-        Args:
-            structure: structure of the models.
-            forgetting: forgetting factor of the adaptive model.
-        """
+        """Predictor that knows nothing."""
         return cls(structure, RecursiveLeastSquares(structure.parameters, forgetting), LaggedRows(structure))
 
     @property
@@ -188,13 +179,7 @@ class ArxPredictor(Memory, dict=True):
         return slice(first, first + self.structure.input_lags * self.structure.inputs)
 
     def update(self, inputs: Sequence[float], value: float, *, follows: bool) -> float:
-        """Update with a row; returns the prediction made before it, NaN if there is none.
-
-        Args:
-            inputs: one value an input; NaN if missing.
-            value: output; NaN if missing.
-            follows: True if the row before was one period ago.
-        """
+        """Update with a row; returns the prediction made before it, NaN if there is none."""
         if self.scaling is None:
             self._learn_scaling(inputs, value)
             return nan
@@ -315,10 +300,6 @@ class ArxMemory(Memory, tag="arx"):
 class ArxReference(Reference):
     """Identified models of one plant, one an output.
 
-    Args:
-        config: settings of the monitor.
-        points: True to publish predictions.
-
     Attributes:
         config: settings of the monitor.
         points: True to publish predictions.
@@ -342,10 +323,6 @@ class ArxReference(Reference):
 
     def resume(self, predictors: Sequence[ArxPredictor], *, follows: bool) -> None:
         """Resume from models of the same settings.
-
-        Args:
-            predictors: the models, which are copied.
-            follows: True if the next row follows the ones before.
 
         Raises:
             ValueError: the models are of other settings.

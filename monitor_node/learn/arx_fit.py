@@ -52,10 +52,6 @@ def _learn_again(models: ArxReference, index: int, structure: Structure, rows: R
 def fit_models(models: ArxReference, rows: RowArrays) -> Array:
     """Fit each model to a training, with the largest structure that its rows allow.
 
-    Args:
-        models: the models; one that gets another structure is updated with the rows again.
-        rows: rows of the training.
-
     Returns:
         Residuals, shape (n, outputs), scaled to the size of out-of-sample residuals; NaN if missing. With too few rows
         for any structure there is no fitted model of the output, and all are NaN.
@@ -165,10 +161,6 @@ def start_judging(models: ArxReference, rows: RowArrays) -> None:
 def start_drift_chart(model: ArxPredictor, arl0: float) -> None:
     """Start the chart of the difference between the parameters of the adaptive model and the fitted one.
 
-    Args:
-        model: model of an output.
-        arl0: in-control run length of the chart, in rows.
-
     Raises:
         InputError: the training was too short for that, or the model does not forget.
     """
@@ -192,16 +184,7 @@ def adaptive_snapshot(model: ArxPredictor) -> ModelSnapshot | None:
 def _snapshot(
     model: ArxPredictor, parameters: Array, covariance: Array, condition: float, rows: int, forgetting: float
 ) -> ModelSnapshot:
-    """Snapshot in the signals' units, without a time.
-
-    Args:
-        model: model of an output.
-        parameters: parameters for scaled signals, shape (parameters,).
-        covariance: covariance of `parameters`, shape (parameters, parameters).
-        condition: condition number of the regressors.
-        rows: number of rows that the model has learned from.
-        forgetting: forgetting factor.
-    """
+    """Snapshot in the signals' units, without a time."""
     assert model.scaling is not None
     structure, (matrix, shift) = model.structure, model.scaling.unscaling(model.structure)
     values, sds = matrix @ parameters + shift, standard_deviations(covariance, matrix)

@@ -97,20 +97,12 @@ class TrainingResult(NamedTuple):
 
         Where it did not determine the dynamics, each new set point may raise every alarm, and the next may come within
         the length of the training.
-
-        Args:
-            arl0: in-control run length of each alarm, in rows.
         """
         return max(self.after_moves.excess_rate(arl0), arl0 / len(self.z) if self.weakness else 0.0)
 
 
 def fewest_values(config: MonitorConfig, model: ProcessModel | None) -> int:
-    """Least number of values of each output that a training needs.
-
-    Args:
-        config: settings of the monitor.
-        model: process model; None: there is none.
-    """
+    """Least number of values of each output that a training needs."""
     structure = arx_structure(config)
     of_one_input = replace(structure, inputs=min(structure.inputs, 1))
     return FEWEST_ROWS if model is not None else max(arx_fit.fewest_rows(of_one_input), FEWEST_ROWS)

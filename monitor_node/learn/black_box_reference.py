@@ -76,9 +76,6 @@ class BlackBoxMemory(Memory, tag="black-box"):
 class BlackBoxReference(FilterReference):
     """Filter of a state map whose parameters are learned; see `references.Reference`.
 
-    Args:
-        memory: the fitted state map, and where its filter stands.
-
     Attributes:
         model: the fitted state map.
     """

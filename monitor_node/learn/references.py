@@ -93,12 +93,7 @@ class Reference(ABC):
 
     @abstractmethod
     def update(self, row: MeasuredRow, accept: tuple[bool, ...]) -> RowPrediction:
-        """Predict a row, then update with it.
-
-        Args:
-            row: the row.
-            accept: one flag an output: it corrects the reference whatever its residual.
-        """
+        """Predict a row, then update with it; an accepted output corrects the reference whatever its residual."""
 
     @abstractmethod
     def restart(self) -> None:
@@ -135,22 +130,13 @@ class Reference(ABC):
         return None
 
     def snapshot(self, output: int, inputs: tuple[str, ...], outputs: tuple[str, ...]) -> ModelSnapshot | None:
-        """Snapshot of the model of an output; None if the reference has no model of its own for it.
-
-        Args:
-            output: index of the output among the monitored ones.
-            inputs: names of the inputs.
-            outputs: names of the monitored outputs.
-        """
+        """Snapshot of the model of an output; None if the reference has no model of its own for it."""
         return None
 
     def step_responses(self, rows: int) -> Array | None:
         """Response of each normalised residual to a lasting step of one unit of its output, shape (outputs, rows).
 
         NaN where there is no model; None with equations.
-
-        Args:
-            rows: number of rows from the onset on.
         """
         return None
 

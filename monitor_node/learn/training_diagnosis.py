@@ -150,13 +150,7 @@ def _shorten_gaps(time_min: Array) -> Array:
 
 
 def _diagnose(record: Record, model: ProcessModel, uncertain: Uncertain) -> tuple[str, str, ExtendedModel | None]:
-    """Verdict of the diagnosis, the reason, and the model with the causes that last; None: there are none.
-
-    Args:
-        record: the training.
-        model: equations of the plant.
-        uncertain: what its filter estimates beside the states, see `find_uncertain`.
-    """
+    """Verdict of the diagnosis, the reason, and the model with the causes that last; None: there are none."""
     from reactorwatch.diagnosis.diagnose import diagnose  # a quarter of a second, which no other row needs
 
     try:
@@ -230,13 +224,7 @@ MOVE_ROWS = 60
 
 
 def find_uncertain(model: ProcessModel, outputs: tuple[str, ...], rows: RowArrays) -> Uncertain:
-    """Find additional states that a filter of the model needs; empty: none.
-
-    Args:
-        model: equations of the plant.
-        outputs: names of the outputs.
-        rows: rows of the training.
-    """
+    """Find additional states that a filter of the model needs; empty: none."""
     if np.min(np.count_nonzero(np.isfinite(rows.outputs), axis=0), initial=LEAST_ROWS) < LEAST_ROWS:
         return Uncertain()
     fitter = _NoiseFitter(model, outputs, rows)

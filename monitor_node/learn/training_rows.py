@@ -68,13 +68,7 @@ class TrainingRows(Memory):
     keeps_all: bool = False
 
     def add(self, time_ns: int, inputs: Sequence[float], values: Sequence[float]) -> None:
-        """Add a row.
-
-        Args:
-            time_ns: time of the row.
-            inputs: one value an input; NaN if missing.
-            values: outputs; NaN if missing.
-        """
+        """Add a row."""
         if self.times and time_ns <= self.times[-1]:  # the publisher was restarted: so is the record
             del self.times[:], self.numbers[:]
             self.counts, self.dropped = [0] * len(values), 0

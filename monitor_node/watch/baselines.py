@@ -56,15 +56,6 @@ class ModesMemory(Memory):
 class Baselines:
     """Baselines of one plant.
 
-    Args:
-        config: settings of the monitor.
-        model: process model of the plant as given; None if there is none.
-        evaluation: stages of the evaluation of its rows.
-        operation: operation of the plant.
-        failures: counter of errors in the change of the model.
-        changes: changes of the baseline to come.
-        diagnose: diagnoses the training before the first row is evaluated; None: the caller takes `diagnosis_job`.
-
     Attributes:
         training: training of the plant.
         update: changes of the baseline to come, and the one in force.
@@ -110,14 +101,7 @@ class Baselines:
     def end_training(
         self, time_ns: int, trained: TrainingResult, period_ns: float, units: Sequence[str]
     ) -> Baseline | None:
-        """Judge by what was learned from now on; returns the change of the model by the diagnosis of the training.
-
-        Args:
-            time_ns: time of the last row.
-            trained: result of the training.
-            period_ns: sampling period.
-            units: units of the outputs.
-        """
+        """Judge by what was learned from now on; returns the change of the model by the diagnosis of the training."""
         self.start(trained, period_ns)
         if self._config.diagnose_training and equations_text(self._model):
             self.update.rows = trained.rows
@@ -322,11 +306,6 @@ def _key_of(mode: list[float]) -> str:
 class ModelUpdate:
     """Pending diagnosis of a plant's training, and the change that follows it.
 
-    Args:
-        config: settings of the monitor.
-        changes: changes to come, in order, each with the time of the first row that is judged by it, 0 for the next
-            row; the caller may append those of a recording.
-
     Attributes:
         changes: changes to come.
         rows: rows of the training until it was diagnosed and the change was made; None: there are none.
@@ -341,11 +320,7 @@ class ModelUpdate:
         self.baseline: Baseline | None = None
 
     def job(self, model: ProcessModel | None) -> DiagnosisJob | None:
-        """The pending diagnosis; None: there is none.
-
-        Args:
-            model: process model of the plant as given.
-        """
+        """The pending diagnosis; None: there is none."""
         if self.rows is None or self.changes:
             return None
         return DiagnosisJob(self.rows, self._config.signals, equations_text(model))
@@ -400,10 +375,6 @@ class ModelUpdate:
     def relearn(self, change: Baseline, models: ArxReference) -> TrainingResult | None:
         """Learn the baseline again from the rows of the training, which are dropped, with the model of a change.
 
-        Args:
-            change: the change, which is in force afterwards.
-            models: the identified models, which stay as they are.
-
         Returns:
             The result; None if the new equations do not judge the plant any better than the identified models.
         """
@@ -428,12 +399,6 @@ TRAINED = "trained"
 
 def check_command(command: BaselineCommand, kept: Sequence[int], *, has_rows: bool, has_alarm: bool) -> Baseline:
     """Check a command other than `list`; returns the change, without its time and number.
-
-    Args:
-        command: the command.
-        kept: numbers of the baselines that can be restored, the one before last.
-        has_rows: True if a row has come.
-        has_alarm: True if an alarm without a known cause is active, and rows are judged.
 
     Raises:
         InputError: the command is refused.

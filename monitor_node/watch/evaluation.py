@@ -87,35 +87,7 @@ class EvaluationMemory(Memory, kw_only=True):
 
 
 class Evaluation:
-    """Stages of the evaluation of one plant's rows.
-
-    Args:
-        config: settings of the monitor.
-        board: alarms of the plant; those of the stages are declared here.
-        models: identified models.
-        model: process model of the plant; None if there is none.
-        is_process: True if the plant is known to be the model's, whatever judges it.
-        promises: stage of the promise of false alarms.
-
-    Attributes:
-        memory: memory of the stages; `collect_memory` completes it.
-        models: identified models.
-        ordinary: the compiled step, with the numbers of the stages.
-        signals: signal checks.
-        charts: charts.
-        drift: drift charts.
-        shift: tests of lasting steps.
-        promises: stage of the promise of false alarms.
-        whiteners: prewhitening filters, one an output.
-        whitener_numbers: numbers of these filters, shape (outputs,).
-        whitened_sds: standard deviation of each prewhitened residual, in those of the residual.
-        reference: the reference; None if rows are not evaluated.
-        suspicion: search for causes; None if there is none.
-        evaluated: for each output, True if it is evaluated.
-        is_process: True if the plant is the model's.
-        is_ordinary: True if the compiled step may take the next row, see `row_step`.
-        notes: notes to log, oldest first; the caller empties the list.
-    """
+    """Stages of the evaluation of one plant's rows."""
 
     def __init__(
         self,
@@ -200,13 +172,7 @@ class Evaluation:
     # --- start and stop --------------------------------------------------------------------------------------
 
     def start(self, trained: TrainingResult, period_ns: float, *, again: bool) -> None:
-        """Start to evaluate rows.
-
-        Args:
-            trained: result of the training.
-            period_ns: sampling period.
-            again: True if rows are evaluated already, by another model; the drift of the identified models goes on.
-        """
+        """Start to evaluate rows, or `again` by another model: the drift of the identified models then goes on."""
         self._leave_out(trained.left_out)
         unmade = self.charts.design.choose(self.evaluated, trained.e, trained.values)
         self.shift.is_active = trained.responses is not None and not self._config.has_values_only
@@ -235,14 +201,7 @@ class Evaluation:
     def check_training(
         self, trained: TrainingResult, model: ProcessModel | None, period_ns: float, units: Sequence[str]
     ) -> None:
-        """Judge the training by itself, and state the power of the watch that has started with it.
-
-        Args:
-            trained: result of the training.
-            model: equations that judge; None: none do.
-            period_ns: sampling period.
-            units: units of the outputs.
-        """
+        """Judge the training by itself, and state the power of the watch that has started with it."""
         watch: Watch | None = None
         if self.promises.states_power:
             watch = Watch(
@@ -352,10 +311,6 @@ class Evaluation:
     def _share_budget(self, period_min: float, checks: list[Check]) -> float:
         """In-control run length of each alarm, in rows.
 
-        Args:
-            period_min: sampling period.
-            checks: checks of the training; one is added where less is promised or tested than usual.
-
         Raises:
             InputError: the charts cannot keep the rate that the settings ask for.
         """
@@ -421,10 +376,6 @@ class Evaluation:
 
 def check_promise(config: MonitorConfig, period_min: float) -> None:
     """Check that charts can keep the promised number of false alarms, with every output monitored.
-
-    Args:
-        config: settings of the monitor.
-        period_min: sampling period in minutes.
 
     Raises:
         InputError: charts cannot keep the promise.

@@ -43,11 +43,6 @@ class CarriedState(msgspec.Struct, forbid_unknown_fields=True):
 class Operation:
     """Follows the operation of one plant.
 
-    Args:
-        config: settings of the monitor.
-        bounds: bounds of each input.
-        units: units by signal.
-
     Attributes:
         memory: states of modes and set points, by signal.
     """

@@ -71,16 +71,6 @@ class PipelineMemory(Memory):
 class PlantPipeline:
     """Pipeline of one plant.
 
-    Args:
-        config: settings of the monitor.
-        board: alarms of the plant.
-        points: True to publish estimates, chart points and models.
-        model: see `Monitor`.
-        failures: counter of errors in the search for causes; None: a new one.
-        changes: changes of the baseline to come.
-        diagnose: diagnoses the training before the first row is evaluated; None: the caller takes `diagnosis_job`.
-        promises: stage of the promise of false alarms; None: one that checks and states nothing more.
-
     Raises:
         InputError: the settings ask for a process model that does not fit the plant's signals.
 
@@ -161,10 +151,6 @@ class PlantPipeline:
 
     def resume(self, memory: PipelineMemory, now_ns: int) -> None:
         """Resume bit-identically from a memory of the same settings; the alarms are restored before.
-
-        Args:
-            memory: the memory, which is then the one that runs.
-            now_ns: present time, from which the data timeout counts.
 
         Raises:
             ValueError: the memory is damaged.
@@ -331,14 +317,7 @@ class PlantPipeline:
     def _publish_estimates(
         self, row: MeasuredRow, predictions: Sequence[float], sds: Sequence[float], scales: Sequence[float]
     ) -> None:
-        """Publish the reference's estimates, with limits about the value that each prewhitening filter expected.
-
-        Args:
-            row: the row.
-            predictions: prediction of each output.
-            sds: standard deviation of each prediction error.
-            scales: standard deviation of each prewhitened residual in the output's unit.
-        """
+        """Publish the reference's estimates, with limits about the value that each prewhitening filter expected."""
         expected, widths = self.evaluation.whitener_numbers["expected"].tolist(), self.evaluation.charts.memory.widths
         limits: list[tuple[float, float, float]] = []
         for prediction, sd, scale, mean, width in zip(predictions, sds, scales, expected, widths, strict=True):
@@ -351,12 +330,7 @@ class PlantPipeline:
     ) -> None:
         """Compare the models, apply the changes of alarms, and let what follows from alarms follow.
 
-        Args:
-            row: the row.
-            changes: changes of alarms so far.
-            before: number of publications before the row.
-            stuck: flags of the outputs whose sensors are stuck; None: an ordinary row, of which the causes are not
-                searched and nothing is learned.
+        Without flags of stuck sensors it is an ordinary row: causes are not searched, and nothing is learned.
         """
         evaluation, memory, board = self.evaluation, self.evaluation.memory, self._board
         reference, publications = evaluation.reference, row.publications
@@ -432,9 +406,6 @@ class PlantPipeline:
     def end_training(self, time_ns: int) -> None:
         """End the training with the rows so far; the next row is the first of another run of the plant.
 
-        Args:
-            time_ns: time of the last row.
-
         Raises:
             InputError: there are too few rows to learn from, or no output can be watched.
         """
@@ -482,14 +453,7 @@ def _publish_estimates(
     predictions: Sequence[float],
     limits: Iterable[tuple[float, float, float]] = repeat((0.0, nan, nan)),
 ) -> None:
-    """Publish estimates of a row's outputs that have a value and a prediction.
-
-    Args:
-        row: the row.
-        paths: key of each output's estimate.
-        predictions: prediction of each output.
-        limits: standard deviation of each residual, and the lower and upper limit of the value; NaN: not learned yet.
-    """
+    """Publish estimates of a row's outputs that have a value and a prediction."""
     of_outputs = zip(paths, predictions, row.values, row.units, strict=True)
     for (path, prediction, value, unit), (sd, lower, upper) in zip(of_outputs, limits, strict=False):
         residual = value - prediction

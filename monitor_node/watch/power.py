@@ -87,12 +87,7 @@ class Watch(NamedTuple):
 
 
 def state_power(watch: Watch, rows: TrainingRows) -> list[Power]:
-    """Sizes of steps, then of ramps, that are seen; empty for a training that is too short.
-
-    Args:
-        watch: the plant.
-        rows: rows of its training.
-    """
+    """Sizes of steps, then of ramps, that are seen; empty for a training that is too short."""
     deviations = _deviations(watch, rows)
     if not deviations:
         return []

@@ -80,12 +80,7 @@ class PlantPromise(Memory):
     power: bytes = b""
 
     def count_alarms(self, count: int, row: int) -> tuple[bool, bool]:
-        """Count alarms that chance can raise; returns whether the plant had drifted before, and has now.
-
-        Args:
-            count: number of alarms of a row.
-            row: number of rows judged since the training.
-        """
+        """Count alarms that chance can raise; returns whether the plant had drifted before, and has now."""
         had_drifted = self.has_drifted(row)
         self.events += not self.found or row - self.last_row > 20
         self.found, self.last_row = self.found + count, row
@@ -150,12 +145,7 @@ class PlantPromise(Memory):
         return "; ".join(parts)
 
     def message(self, time_ns: int, rows: int) -> Promise:
-        """The message on the bus.
-
-        Args:
-            time_ns: time of the newest row.
-            rows: number of rows judged since the training.
-        """
+        """The message on the bus."""
         return Promise(
             time_ns=time_ns,
             expected=self.per_30_days,
@@ -192,12 +182,7 @@ def describe_rate(per_30_days: float) -> str:
 
 
 def probability_of(found: int, expected: Array) -> float:
-    """Probability of at least so many alarms by chance.
-
-    Args:
-        found: number of alarms.
-        expected: mean number for each of the errors that the training may have made.
-    """
+    """Probability of at least so many alarms by chance."""
     return float(np.mean(pdtrc(found - 1, expected))) if found else 1.0
 
 
@@ -228,14 +213,6 @@ CheckTraining: TypeAlias = Callable[[MonitorConfig, ProcessModel | None, Trainin
 
 class PromiseStage:
     """The promise of one plant.
-
-    Args:
-        config: settings of the monitor.
-        board: alarms of the plant, whose texts warn of a promise that is not kept.
-        failures: counter of errors, which leave the promise without what they concern.
-        check: judges the training by itself; None: that is not done.
-        states_power: True to state the deviations that would be seen.
-        points: True to publish each promise; False: only one that is not kept or no longer holds.
 
     Attributes:
         alarm_rates: false alarms a row by the errors that the training may have made, shape (draws,), after its end.
@@ -271,14 +248,7 @@ class PromiseStage:
         self._board.warning = "" if promise is None else promise.warning
 
     def start(self, rates: Array, mean_rate: float, period_min: float, excess: float) -> None:
-        """State the promise after a training; alarms so far go on to count.
-
-        Args:
-            rates: see `alarm_rates`.
-            mean_rate: false alarms a row, on average over trainings.
-            period_min: sampling period.
-            excess: times as many false alarms as promised that residuals after moves of the inputs raise.
-        """
+        """State the promise after a training; alarms so far go on to count."""
         self.alarm_rates = rates
         rows = false_alarm_budget.DAYS_MIN / period_min
         mean, upper = rows * mean_rate, rows * float(np.quantile(rates, QUANTILE))
@@ -289,12 +259,6 @@ class PromiseStage:
 
     def check(self, trained: TrainingResult, model: ProcessModel | None, watch: Watch | None, rows_watched: int) -> str:
         """Judge the training by itself, and state the power; an error there leaves the promise without them.
-
-        Args:
-            trained: result of the training.
-            model: equations that judge; None: none do.
-            watch: the plant as it is watched, to state its power by; None: that is not stated.
-            rows_watched: number of rows evaluated since.
 
         Returns:
             A note if the promise is not kept, else empty.
@@ -331,12 +295,6 @@ class PromiseStage:
 
     def count_alarms(self, time_ns: int, rows: int, alarms: list[Alarm], publications: list[Publication]) -> str:
         """Count the alarms of a row that chance can raise.
-
-        Args:
-            time_ns: time of the row.
-            rows: number of rows judged since the training.
-            alarms: alarms of the row.
-            publications: publications of the row, to which the promise is added if its counts have changed.
 
         Returns:
             A note if the plant has drifted from its training by this row, else empty.

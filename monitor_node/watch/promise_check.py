@@ -64,14 +64,7 @@ class _Trial(NamedTuple):
 def check_training(
     config: MonitorConfig, model: ProcessModel | None, rows: TrainingRows, reference: str
 ) -> TrainingCheck:
-    """Judge the second half of a training by the first; one that is too short is not judged.
-
-    Args:
-        config: settings of the monitor.
-        model: process model in force; None: there is none.
-        rows: rows of the training.
-        reference: kind of the reference that the full training has chosen.
-    """
+    """Judge the second half of a training by the first; one that is too short is not judged."""
     aligned = [Row(time_ns, tuple(values), False) for time_ns, values in zip(rows.times_ns, rows.values(), strict=True)]
     half = len(aligned) // 2
     settings = msgspec.structs.replace(config, reference=reference, isolation=False, diagnose_training=False)

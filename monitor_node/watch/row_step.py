@@ -228,10 +228,6 @@ _STEP = Entry(step)
 class OrdinaryRows:
     """Compiled step of one plant, with the numbers that it updates.
 
-    Args:
-        config: settings of the monitor.
-        ranges: ranges of each input and of each output.
-
     Attributes:
         numbers: numbers of the stages, shape (1,), see `row_frame.FrameTypes`.
         reference: the reference whose rows the step takes; None where there is no step.
