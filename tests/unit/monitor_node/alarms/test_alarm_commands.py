@@ -1,7 +1,5 @@
 """Operators' alarm commands on the bus: done and published, or refused in one line with nothing changed."""
 
-import gc
-import shutil
 from pathlib import Path
 
 import pytest
@@ -23,7 +21,6 @@ from reactorwatch.contract.messages_pb2 import (
     ListAlarms,
     ShelveAlarm,
 )
-from reactorwatch.errors import InputError
 from reactorwatch.records.record import to_time_ns
 from reactorwatch.runtime.bus import Request
 from tests.memory_bus import Exchange, MemoryBus
@@ -245,17 +242,6 @@ def test_a_flood_of_commands_is_refused_counted_and_written_nowhere(
     assert reply.accepted
 
 
-def test_another_monitor_of_the_plant_is_reported(room: Room, capsys: pytest.CaptureFixture[str]) -> None:
-    """And its own token, which it sees as well, is not."""
-    room.node.on_alive(room.node.token, True, 0)
-    assert capsys.readouterr().out == ""
-    other = MonitorNode(CONFIG, 7).token
-    assert room.node.on_alive(other, True, 0) == []
-    assert "another monitor watches this plant; stop one of them" in capsys.readouterr().out
-    room.node.on_alive(other, False, 0)
-    assert "the other monitor of this plant has gone" in capsys.readouterr().out
-
-
 def test_before_the_first_sample_nothing_can_be_acknowledged() -> None:
     reply = Room(CONFIG).ask("acknowledge", by_anna())
     assert not reply.accepted
@@ -264,43 +250,3 @@ def test_before_the_first_sample_nothing_can_be_acknowledged() -> None:
 
 def test_the_plant_and_the_monitor_share_no_command() -> None:
     assert not set(COMMANDS) & set(PLANT_COMMANDS)
-
-
-def test_alarm_states_survive_a_restart(tmp_path: Path, leak: list[Encoded]) -> None:
-    """The first monitor was killed, and the second has other settings: it has the alarms, and trains."""
-    config = replace(CONFIG, state_file=str(tmp_path / "monitor.state"))
-    first = Room(config)
-    first.receive(leak)
-    first.ask("acknowledge", by_anna(comment="seen"))
-    first.ask("shelve", ShelveAlarm(alarm="shewhart/C", by="Ben", minutes=5.0))
-    del first
-    gc.collect()  # the lock of its file ends with it, as with a process
-
-    second = Room(replace(config, order=2))
-    c, t = (listed(second)[name] for name in ("shewhart/C", "shewhart/T"))
-    assert (t.state, t.by, t.comment, t.incident) == (AlarmState.ALARM_STATE_ACKNOWLEDGED, "Anna", "seen", 1)
-    assert (c.state, c.shelved_until_ns) == (AlarmState.ALARM_STATE_SHELVED, to_time_ns(END_MIN + 5))
-    time_min, columns = leaking_run(0.0, 1.0, 10.0, seed=1)
-    said = second.receive(list(samples(time_min + END_MIN, columns)))
-    (back,) = [item.message for item in said if isinstance(item.message, Alarm) and item.message.alarm == c.alarm]
-    assert (back.alarm, back.event, back.time_ns) == ("shewhart/C", "shelf time over", to_time_ns(END_MIN + 5))
-    assert second.node.monitor(PLANT).phase == "training"
-
-
-def test_a_file_in_no_folder_is_refused_at_the_start(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="does not exist"):
-        MonitorNode(MonitorConfig(state_file=str(tmp_path / "none" / "monitor.state")), 0)
-
-
-def test_a_file_that_can_no_longer_be_written_stops_no_watch(
-    tmp_path: Path, alarmed: bytes, capsys: pytest.CaptureFixture[str]
-) -> None:
-    folder = tmp_path / "gone"
-    folder.mkdir()
-    room = Room(replace(CONFIG, state_file=str(folder / "monitor.state")), alarmed)
-    shutil.rmtree(folder)
-    assert room.ask("acknowledge", by_anna()).accepted
-    assert "does not exist" in capsys.readouterr().out
-    folder.mkdir()
-    room.node.on_tick(10_000_000_000)  # it is tried again
-    assert (folder / "monitor.state").stat().st_size > 0

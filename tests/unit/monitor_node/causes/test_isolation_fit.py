@@ -8,8 +8,8 @@ import pytest
 from monitor_node.causes.isolation import Fitter, causes_of
 from monitor_node.causes.scan import Candidate, GlrScan, scan_candidates
 from monitor_node.causes.window import Window, window_of
-from reactorwatch.diagnosis.fitting.profiles import EndedRamp, FittedProfile, Ramp, Step
-from reactorwatch.kalman.batch import BudgetExceededError, StepBudget
+from reactorwatch.diagnosis.fitting.profiles import EndedRamp, Ramp, Step
+from reactorwatch.kalman.batch import StepBudget
 from reactorwatch.kalman.ekf import Filter
 from reactorwatch.process.library.cstr import cstr
 from tests.unit.monitor_node.faulty import ONSET_MIN, SENSORS, rows_of
@@ -56,35 +56,6 @@ def test_sizes_stay_possible_and_none_begins_at_nothing() -> None:
     for item in [*scan_candidates(CAUSES, scan, window), *fits_of(window)]:
         assert item.effect.lower <= item.parameters[0] <= item.effect.upper
         assert item.parameters[0] != 0.0
-
-
-def candidate(profile: type[FittedProfile], parameters: list[float]) -> Candidate:
-    return Candidate(CAUSES[0], profile, np.array(parameters), 0.0)
-
-
-def test_a_ramp_keeps_its_slope_where_rows_are_added_and_nothing_else_changes() -> None:
-    for profile, before, after in (
-        (Ramp, [2.0, 10.0], [6.0, 10.0]),
-        (Step, [2.0, 10.0], [2.0, 10.0]),
-        (EndedRamp, [2.0, 10.0, 15.0], [2.0, 10.0, 15.0]),
-    ):
-        assert candidate(profile, before).extrapolate(20.0, 40.0).parameters.tolist() == after
-
-
-def test_a_ramp_may_end_elsewhere_with_the_same_slope() -> None:
-    assert candidate(Step, [2.0, 10.0]).end_trials(40.0) == []
-    for item in (candidate(Ramp, [6.0, 10.0]), candidate(EndedRamp, [2.0, 10.0, 20.0])):
-        trials = item.end_trials(40.0)
-        assert len(trials) > 3
-        for trial in trials:
-            end_min = 40.0 if trial.profile is Ramp else trial.parameters[2]
-            assert trial.parameters[0] / (end_min - 10.0) == pytest.approx(0.2)
-    assert [trial.profile for trial in trials][-1] is Ramp  # one that has ended may go on
-
-
-def test_a_fit_ends_where_its_budget_does() -> None:
-    with pytest.raises(BudgetExceededError):
-        fits_of(window_with("coolant_flow:step:-0.05"), StepBudget(2_000))
 
 
 def test_an_ended_ramp_has_the_mean_of_its_values_in_each_interval() -> None:

@@ -8,17 +8,7 @@ from reactorwatch.contract.codec import Encoded, Publication, encode_message
 from reactorwatch.contract.messages_pb2 import Alarm, AlarmCommand, CommandReply, Health
 from reactorwatch.errors import InputError
 
-from ..fleets import QUICK, SECOND_NS, alarms, fleet, of, row_by_row
-
-
-def test_each_plant_is_watched_as_if_it_were_alone(
-    runs: dict[str, list[Encoded]], expected: dict[str, list[Publication]]
-) -> None:
-    monitor = fleet()
-    said = [item for message in row_by_row(runs.values()) for item in monitor.on_message(message, 0)]
-    assert alarms(expected["b"])
-    for plant in runs:
-        assert of(plant, said) == expected[plant]
+from ..fleets import QUICK, SECOND_NS, fleet, of, row_by_row
 
 
 def test_a_batch_of_messages_gives_the_output_of_each_alone(

@@ -8,7 +8,6 @@ from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from monitor_node.watch.promise import (
     PlantPromise,
-    describe_rate,
     extrapolate_count,
 )
 from reactorwatch.contract.messages_pb2 import Promise
@@ -113,11 +112,6 @@ def test_counts_at_other_limits_follow_from_a_common_factor_of_the_residuals() -
     """Limits 1.2 times too tight: run lengths are A^(1 / 1.44)."""
     found = 4500.0 / 1500.0 ** (1 / 1.44)
     assert extrapolate_count(round(found), 1500.0, 4500.0, 1e6) == pytest.approx(4500.0 / 1e6 ** (1 / 1.44), rel=0.1)
-
-
-@pytest.mark.parametrize(("rate", "words"), [(1080.0, "1 in 40 min"), (20.0, "1 in 36 h"), (1.0, "1 in 30 days")])
-def test_rates_in_words(rate: float, words: str) -> None:
-    assert describe_rate(rate) == words
 
 
 def test_a_back_test_has_the_promise_for_the_rows_it_judged() -> None:
