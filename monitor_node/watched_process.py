@@ -143,6 +143,26 @@ def order_inputs(config: MonitorConfig, model: ProcessModel | None) -> MonitorCo
     return msgspec.structs.replace(config, inputs=model.input_names)
 
 
+def judging_equations(config: MonitorConfig, model: ProcessModel | None) -> ProcessModel | None:
+    """Equations by which a plant is judged, as the settings ask for it; None: by none.
+
+    Raises:
+        InputError: the settings ask for equations that do not fit the signals.
+    """
+    if config.reference in ("black-box", "arx") or (model is None and config.process == WITHOUT_EQUATIONS):
+        return None
+    given, model = model is not None, model or DEFAULT.require_model()
+    if config.inputs == model.input_names and set(config.outputs) <= set(model.output_names):
+        return model
+    if config.reference == "auto" and not given:
+        return None
+    raise InputError(
+        f"reference 'equations' needs the signals of {model.name}, inputs {', '.join(model.input_names)} and outputs "
+        f"of {', '.join(model.output_names)}, got {', '.join(config.inputs) or 'none'} and "
+        f'{", ".join(config.outputs)}; set reference = "arx"'
+    )
+
+
 def limit_training(config: MonitorConfig, rows: int | None, *, is_stated: bool | None = None) -> MonitorConfig:
     """Limit a training that is not stated to a third of a record; that of the reactor stays as it is."""
     stated = _states_training(config) if is_stated is None else is_stated

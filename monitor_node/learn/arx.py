@@ -94,8 +94,7 @@ class LaggedRows(Memory, dict=True):
     inputs: list[float] = msgspec.field(default_factory=list)
 
     def __post_init__(self) -> None:
-        structure = self.structure
-        self._history = structure.history
+        structure, self._history = self.structure, self.structure.history
         if len(self.inputs) != len(self.outputs) * structure.inputs or len(self.outputs) > self._history:
             raise ValueError(f"there must be at most {self._history} equal rows, got {len(self.outputs)}")
         first = structure.delay - 1
@@ -346,8 +345,7 @@ class ArxReference(Reference):
             raise ValueError(f"rows before must have shape {shape}, got {memory.past.shape}")
         self._memory, self.obstacles = memory, {}
         self._uses_inputs = np.array([predictor.structure.inputs > 0 for predictor in self.predictors])
-        ranges = zip(memory.low, memory.high, strict=True)
-        self._ranges = list(enumerate(ranges)) if self._uses_inputs.any() else []
+        self._ranges = list(enumerate(zip(memory.low, memory.high, strict=True))) if self._uses_inputs.any() else []
         if memory.past is not None:
             self._set_matrices(*shape)
 

@@ -16,7 +16,7 @@ from monitor_node.charts.charts import ChartsMemory, ChartWatch
 from monitor_node.charts.shift_and_drift import NAME as SHIFT
 from monitor_node.charts.shift_and_drift import DriftWatch, ShiftWatch
 from monitor_node.checks.base import CheckTraining
-from monitor_node.checks.stage import SignalChecks
+from monitor_node.checks.signal_checks import SignalChecks
 from monitor_node.config import MonitorConfig
 from monitor_node.ingest.rows import SamplingPeriod
 from monitor_node.learn.arx import ArxMemory, ArxPredictor, ArxReference

@@ -18,7 +18,7 @@ from monitor_node.alarms.alarms import AlarmChange
 from monitor_node.alarms.annunciator import Annunciator
 from monitor_node.causes.stage import Suspicion
 from monitor_node.checks.base import CheckRow
-from monitor_node.config import DEFAULT, WITHOUT_EQUATIONS, MonitorConfig
+from monitor_node.config import MonitorConfig
 from monitor_node.health import NODE, Failures
 from monitor_node.ingest.rows import MeasuredRow, Row, SamplingPeriod
 from monitor_node.learn.arx import ArxReference
@@ -31,11 +31,10 @@ from monitor_node.watch.evaluation import Evaluation, EvaluationMemory, check_pr
 from monitor_node.watch.operation import CarriedState, Operation
 from monitor_node.watch.promise import PromiseStage
 from monitor_node.watch.row_step import EVENT, VIOLATING
-from monitor_node.watched_process import input_bounds
+from monitor_node.watched_process import input_bounds, judging_equations
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Publication
 from reactorwatch.contract.messages_pb2 import Alarm, Baseline, Estimate
-from reactorwatch.errors import InputError
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MINUTE_NS
 from reactorwatch.spc.prewhitening import innovations
@@ -101,7 +100,7 @@ class PlantPipeline:
         self._failures = Failures() if failures is None else failures
         self._points = points
         self._inputs = len(config.inputs)
-        self.model = _model(config, model)
+        self.model = judging_equations(config, model)
         units = {**config.units, **(self.model.units if self.model is not None else {})}
         self.operation = Operation(config, input_bounds(config, self.model), units)
         board.describe_operation = self.operation.describe
@@ -119,14 +118,9 @@ class PlantPipeline:
             is_process=model is not None or config.reference == "equations",
             promises=promises or PromiseStage(config, board, self._failures, points=points),
         )
+        changes = deque() if changes is None else changes
         self.baselines = Baselines(
-            config,
-            self.model,
-            self.evaluation,
-            self.operation,
-            self._failures,
-            deque() if changes is None else changes,
-            diagnose,
+            config, self.model, self.evaluation, self.operation, self._failures, changes, diagnose
         )
         self.training = self.baselines.training
         self._noted: set[str] = set()
@@ -158,11 +152,8 @@ class PlantPipeline:
         update, baselines = self.baselines.update, self.baselines
         if set(memory.operation) != set(self.operation.memory):
             raise ValueError(f"the state must be of {sorted(self.operation.memory)}, got {sorted(memory.operation)}")
-        self._sampling, self.operation.memory, self.training.memory = (
-            memory.sampling,
-            memory.operation,
-            memory.training,
-        )
+        self._sampling = memory.sampling
+        self.operation.memory, self.training.memory = memory.operation, memory.training
         baselines.modes, baselines.kept, update.baseline = memory.modes, memory.kept, memory.change
         update.changes.extend(memory.commands)
         update.rows = memory.undiagnosed if self._config.diagnose_training else None
@@ -191,13 +182,7 @@ class PlantPipeline:
     # --- rows ------------------------------------------------------------------------------------------------
 
     def update(self, row: Row, units: list[str], publications: list[Publication]) -> None:
-        """Process a row.
-
-        Args:
-            row: values, the inputs first.
-            units: units of the outputs.
-            publications: list to which publications are added; those before an error are published nevertheless.
-        """
+        """Process a row, with the units of its outputs; publications before an error are published nevertheless."""
         baselines, evaluation = self.baselines, self.evaluation
         if baselines.update.changes:
             self._change_baseline(row.time_ns, publications)
@@ -258,9 +243,8 @@ class PlantPipeline:
             if row.restarted:
                 evaluation.signals.on_restart()
             self._evaluate(measured, changes)
-            evaluation.is_ordinary = not self._board.has_unexplained and evaluation.find_ordinary(
-                time_ns, self._sampling
-            )
+            if not self._board.has_unexplained:
+                evaluation.is_ordinary = evaluation.find_ordinary(time_ns, self._sampling)
         else:
             if not modes.is_judged and modes.is_learned:
                 evaluation.signals.update("outputs", CheckRow(time_ns, measured.values, measured.units), changes)
@@ -298,9 +282,8 @@ class PlantPipeline:
         if not self.has_judged:
             judged = (*e, *(tested if shift.is_active else ()), *(values if charts.reads_values else ()))
             self.has_judged = any(map(isfinite, judged))
-        memory.quarantined = quarantined = tuple(
-            signals.update("residuals", CheckRow(time_ns, e, units, scales), changes)
-        )
+        quarantined = tuple(signals.update("residuals", CheckRow(time_ns, e, units, scales), changes))
+        memory.quarantined = quarantined
         if True in quarantined:
             for whitener, outlier in zip(evaluation.whiteners, quarantined, strict=True):
                 if outlier:
@@ -461,21 +444,3 @@ def _publish_estimates(
             estimate = Estimate(time_ns=row.time_ns, prediction=prediction, residual=residual, unit=unit)
             estimate.residual_sd, estimate.lower_limit, estimate.upper_limit = sd, lower, upper
             row.publications.append(Publication(path, estimate))
-
-
-def _model(config: MonitorConfig, model: ProcessModel | None) -> ProcessModel | None:
-    """Process model for the plant, as the settings ask for it."""
-    if config.reference in ("black-box", "arx") or (model is None and config.process == WITHOUT_EQUATIONS):
-        return None
-    given, model = model is not None, model or DEFAULT.require_model()
-    fits = config.inputs == model.input_names and set(config.outputs) <= set(model.output_names)
-    if fits:
-        return model
-    if config.reference == "auto" and not given:
-        return None
-    raise InputError(
-        f"reference 'equations' needs the signals of {model.name}, inputs {', '.join(model.input_names)} and outputs "
-        f"of {', '.join(model.output_names)}, got {', '.join(config.inputs) or 'none'} and "
-        f"{', '.join(config.outputs)}; "
-        'set reference = "arx"'
-    )

@@ -18,7 +18,7 @@ from scipy.special import pdtrc
 from monitor_node.alarms.annunciator import Annunciator
 from monitor_node.charts.chart_design import alarm_names
 from monitor_node.charts.shift_and_drift import NAME as SHIFT
-from monitor_node.checks.stage import SignalChecks
+from monitor_node.checks.signal_checks import SignalChecks
 from monitor_node.config import MonitorConfig
 from monitor_node.health import NODE, Failures
 from monitor_node.learn.baseline import TrainingResult

@@ -17,7 +17,7 @@ import numpy as np
 
 from monitor_node.alarms.alarms import add_point, is_ordinary, raises
 from monitor_node.charts.chart_design import alarm_names
-from monitor_node.checks.stage import CHECKS
+from monitor_node.checks.signal_checks import CHECKS
 from monitor_node.config import MonitorConfig
 from monitor_node.ingest.rows import WHOLE
 from monitor_node.learn.references import FilterReference, Reference

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from math import inf
 from typing import NamedTuple
 
-from monitor_node.checks.stage import CHECKS
+from monitor_node.checks.signal_checks import CHECKS
 from reactorwatch.contract.alarm_text import describe_suspects, priority_word, suspects_text
 from reactorwatch.contract.messages_pb2 import Alarm, Suspect
 from reactorwatch.records.record import format_utc, to_minutes

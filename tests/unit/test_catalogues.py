@@ -14,7 +14,7 @@ import pytest
 import monitor_node.checks
 import reactorwatch.spc.charts
 import recorder.panels
-from monitor_node.checks.stage import CHECKS
+from monitor_node.checks.signal_checks import CHECKS
 from monitor_node.config import CHART_SIGNALS, MonitorConfig
 from monitor_node.watch import row_frame, row_step
 from reactorwatch.process import EFFECTS_OF

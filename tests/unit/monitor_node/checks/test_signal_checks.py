@@ -7,7 +7,7 @@ import pytest
 
 from monitor_node.alarms.annunciator import Annunciator
 from monitor_node.checks.base import CheckRow, CheckTraining
-from monitor_node.checks.stage import SignalChecks
+from monitor_node.checks.signal_checks import SignalChecks
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from monitor_node.watch.row_step import types_of

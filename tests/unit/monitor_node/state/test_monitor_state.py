@@ -9,7 +9,7 @@ import pytest
 
 from monitor_node.config import ChartName, MonitorConfig
 from monitor_node.core import Monitor
-from monitor_node.monitor_state import MAGIC, SEAL, ForeignFileError, OtherSettingsError
+from monitor_node.monitor_state import MAGIC, VERSION, ForeignFileError, OtherSettingsError, open_seal, seal
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, encode, encode_message
 from reactorwatch.contract.messages_pb2 import AlarmCommand, Health, ShelveAlarm
@@ -89,10 +89,10 @@ def test_a_monitor_stopped_at_any_samples_publishes_the_same(
     assert len(events) > 3
 
 
-@pytest.mark.parametrize("version", [*range(2, SEAL.version), SEAL.version + 1])
+@pytest.mark.parametrize("version", [*range(2, VERSION), VERSION + 1])
 def test_a_state_of_another_layout_is_refused_in_one_line(version: int) -> None:
-    stored = SEAL._replace(version=version).close(SEAL.open(Monitor(CONFIG, 0).to_bytes()))
-    text = f"is the state of a monitor in version {version}, this software reads {SEAL.version}"
+    stored = seal(open_seal(Monitor(CONFIG, 0).to_bytes()), version)
+    text = f"is the state of a monitor in version {version}, this software reads {VERSION}"
     with pytest.raises(InputError, match=f"^{text}$"):
         Monitor(CONFIG, 0).from_bytes(stored)
 
@@ -116,7 +116,7 @@ def wrong(stored: bytes) -> list[tuple[str, bytes, str]]:
     """What is no state of ours, and what is said of it."""
     damaged = bytearray(stored)
     damaged[len(stored) // 2] ^= 1
-    newer = MAGIC + (SEAL.version + 1).to_bytes(2, "big") + stored[len(MAGIC) + 2 :]
+    newer = MAGIC + (VERSION + 1).to_bytes(2, "big") + stored[len(MAGIC) + 2 :]
     return [
         ("empty", b"", "is no state of a monitor: 0 bytes"),
         ("foreign", b"\x89PNG and so on", "is no state of a monitor: 14 bytes"),
@@ -126,7 +126,7 @@ def wrong(stored: bytes) -> list[tuple[str, bytes, str]]:
         (
             "of another version",
             newer,
-            f"is the state of a monitor in version {SEAL.version + 1}, this software reads {SEAL.version}",
+            f"is the state of a monitor in version {VERSION + 1}, this software reads {VERSION}",
         ),
     ]
 
