@@ -1,4 +1,7 @@
-"""A monitor that resumes from its stored state publishes what it would have published, value for value."""
+"""A monitor that resumes from its stored state publishes what it would have published, value for value.
+
+A stored state names the build that stored it.
+"""
 
 import random
 from itertools import chain
@@ -9,12 +12,23 @@ import pytest
 
 from monitor_node.config import ChartName, MonitorConfig
 from monitor_node.core import Monitor
-from monitor_node.monitor_state import MAGIC, VERSION, ForeignFileError, OtherSettingsError, open_seal, seal
+from monitor_node.monitor_state import (
+    MAGIC,
+    VERSION,
+    ForeignFileError,
+    MonitorState,
+    OtherSettingsError,
+    learning_settings,
+    open_seal,
+    open_state,
+    seal,
+)
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, encode, encode_message
 from reactorwatch.contract.messages_pb2 import AlarmCommand, Health, ShelveAlarm
 from reactorwatch.errors import InputError
 from reactorwatch.process.library.cstr import cstr
+from reactorwatch.version import this_build
 
 from ..samples import PLANT, leaking_run, samples
 
@@ -244,3 +258,16 @@ def test_a_plant_that_publishes_nothing_after_the_stop_is_silent(leak: list[Enco
         due_ns = again.next_tick_ns()
     said = [item for tick in range(10_000, 10_020) for item in again.on_tick(tick * second)]
     assert [item.key for item in said if "/alarm/" in item.key] == [keys.key(PLANT, keys.ALARM, "silence/plant")]
+
+
+def test_a_state_names_the_build_that_stored_it_and_its_refusal_names_another_build() -> None:
+    monitor = Monitor(CONFIG, 0, points=False)
+    settings = learning_settings(CONFIG, monitor.pipeline.model, points=False)
+    data = monitor.to_bytes()
+    assert MonitorState.from_bytes(open_seal(data)).build == this_build()
+    other = msgspec.structs.replace(open_state(data, settings), build="0.2.0 (commit 0123456789ab)").to_bytes()
+    assert open_state(seal(other), settings).settings == settings
+    with pytest.raises(OtherSettingsError, match=r"learned by 0\.2\.0 \(commit 0123456789ab\) with other settings"):
+        open_state(seal(other), settings | {"training_min": 7.0})
+    with pytest.raises(OtherSettingsError, match=r"^was learned with other settings"):
+        open_state(data, settings | {"training_min": 7.0})
