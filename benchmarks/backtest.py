@@ -20,8 +20,8 @@ from monitor_node.replay import backtest
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from reactorwatch.contract.codec import Encoded, decode
-from reactorwatch.identification.black_box.filter import BlackBoxFilter
-from reactorwatch.identification.black_box.fit import fit_black_box
+from reactorwatch.identification.black_box_filter import BlackBoxFilter
+from reactorwatch.identification.black_box_fit import fit_black_box
 
 ROWS, SHORT = 50_000, 7500
 REPEATS = 3

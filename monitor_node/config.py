@@ -12,7 +12,7 @@ from reactorwatch.description.find import find_process
 from reactorwatch.runtime.config import check_bounds
 from reactorwatch.spc.charts.base import Setting, SignalSetting
 from reactorwatch.spc.charts.catalogue import CHARTS, chart
-from reactorwatch.spc.charts.value_chart import FEWEST_SIGNALS, ValueChart
+from reactorwatch.spc.charts.value_chart import ValueChart
 from reactorwatch.spc.run_length import check_rule
 
 CHART_SETTINGS = [setting for chart in CHARTS for setting in chart.settings if isinstance(setting, Setting)]
@@ -222,7 +222,8 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
             )
         if isinstance(self.charts, DefaultCharts):
             count = 0 if self._may_have_equations else len(self.outputs)
-            usual = CHARTS_OF_DOZENS if count >= DOZENS else CHARTS_OF_MANY if count >= FEWEST_SIGNALS else USUAL_CHARTS
+            many = count >= ValueChart.fewest_signals
+            usual = CHARTS_OF_DOZENS if count >= DOZENS else CHARTS_OF_MANY if many else USUAL_CHARTS
             msgspec.structs.force_setattr(self, "charts", usual)
         if len(set(self.charts)) != len(self.charts) or not self.charts:
             raise ValueError(f"charts must be at least one chart, each once, got {self.charts}")

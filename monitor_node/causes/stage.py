@@ -29,7 +29,7 @@ from monitor_node.learn.references import PlantEquations
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Publication
 from reactorwatch.contract.messages_pb2 import Reconstruction as ReconstructionMessage
-from reactorwatch.kalman.batch import STEPS_PER_PREDICTION, STEPS_PER_ROW, BudgetExceededError, StepBudget
+from reactorwatch.kalman.batch import BudgetExceededError, StepBudget, StepCost
 from reactorwatch.kalman.ekf import Filter, FilterState
 from reactorwatch.kalman.ekf_step import NoiseLevels
 from reactorwatch.process.effect import SensorEffect
@@ -46,7 +46,7 @@ FEW_ROWS = 300
 ROWS_BEFORE = 400
 """Number of rows before the first alarm that late looks use."""
 
-START_STEPS, START_STEPS_A_ROW = 25_000 + STEPS_PER_PREDICTION * MOST_PIECES, STEPS_PER_ROW
+START_STEPS, START_STEPS_A_ROW = 25_000 + StepCost.PREDICTION * MOST_PIECES, StepCost.ROW
 """Filter steps for the past rows: enough for each row and a search for steady states."""
 
 

@@ -16,9 +16,9 @@ from monitor_node.learn.training_rows import RowArrays
 from reactorwatch.arrays import Array
 from reactorwatch.contract.messages_pb2 import ModelSnapshot, Parameter
 from reactorwatch.errors import InputError
-from reactorwatch.identification.black_box.filter import MEMORY, BlackBoxFilter, BlackBoxFilterMemory
-from reactorwatch.identification.black_box.fit import fit_black_box
-from reactorwatch.identification.black_box.model import BlackBoxModel
+from reactorwatch.identification.black_box_filter import MEMORY, BlackBoxFilter, BlackBoxFilterMemory
+from reactorwatch.identification.black_box_fit import fit_black_box
+from reactorwatch.identification.black_box_model import BlackBoxModel
 from reactorwatch.kalman.batch import GATE
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MINUTE_NS

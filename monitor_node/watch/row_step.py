@@ -39,7 +39,7 @@ from monitor_node.watched_process import SignalRange
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.compiled_function import CompiledFunction
 from reactorwatch.codegen.numba_kernel import Entry, borrow, call_at, inline, jit
-from reactorwatch.identification.black_box.filter import JUDGED, filter_row
+from reactorwatch.identification.black_box_filter import JUDGED, filter_row
 from reactorwatch.kalman.batch import GATE
 from reactorwatch.kalman.ekf_step import fill_row
 from reactorwatch.records.record import MINUTE_NS

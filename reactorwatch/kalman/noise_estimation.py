@@ -39,13 +39,10 @@ from reactorwatch.process.model import ProcessModel
 INITIAL_SHARES = (0.3, 0.03, 0.003)
 """Initial process noise, in scales of the state per square root of a minute; the noisiest converges best."""
 
-NO_NOISE, NEGLIGIBLE_NOISE = 1e-5, 3e-4  # in scales: as good as none, and one that is but from which steps can start
 CLIP = 4.0  # standard deviations beyond which the loss of a value is constant
 FIRST_ROWS = 300  # that the first steps of the search use
 LONGEST_STEP = 1.2  # of a logarithm: sizes change by at most a factor of 3.3
 DIFFERENCE = 0.01  # of a logarithm, for derivatives
-CONVERGED_GAIN = 0.2  # of log likelihood: less ends the search
-_MEDIAN_THIRD_DIFFERENCE = 0.6745 * sqrt(20.0)  # their median size, for white noise of unit variance
 _CUT_MEAN_SQUARE = erf(CLIP / sqrt(2)) - CLIP * sqrt(2 / pi) * exp(-(CLIP**2) / 2)  # of w where |w| < CLIP, else 0
 
 
@@ -147,7 +144,8 @@ class _NoiseSearch:
         largest = np.max(np.abs(np.nan_to_num(measured)), axis=0)
         smallest_sd = np.maximum(smallest_sd, 1e-9 * np.where(largest > 0.0, largest, 1.0))
         limits = np.log([[item.lower, item.upper] for item in self._learned]).reshape(-1, 2).T
-        self._lowest = np.concatenate([np.log(smallest_sd), np.log(NO_NOISE * self._scales), limits[0]])
+        # 1e-5 scales of process noise are as good as none.
+        self._lowest = np.concatenate([np.log(smallest_sd), np.log(1e-5 * self._scales), limits[0]])
         self._highest = np.concatenate([np.full(self._of_states.stop, inf), limits[1]])
         self._first = np.maximum([initial_sensor_sd(column) for column in measured.T], smallest_sd)
         first = NoiseLevels(tuple(self._first.tolist()), (0.0,) * len(model.states))
@@ -178,7 +176,8 @@ class _NoiseSearch:
     def _with_noise(self, levels: NoiseLevels) -> Array:
         """Theta of these levels, with noise in every state: no step leads out of none."""
         sensors = np.maximum(np.log(levels.measurement_sd), self._lowest[: self._n_y])
-        states = np.maximum(np.array(levels.process_sd)[self._states], NEGLIGIBLE_NOISE * self._scales)
+        # 3e-4 scales of noise are negligible, but steps can start from them.
+        states = np.maximum(np.array(levels.process_sd)[self._states], 3e-4 * self._scales)
         return np.concatenate([sensors, np.log(states), np.log([item.value for item in self._learned])])
 
     def _noisier_starts(self, theta: Array) -> list[Array]:
@@ -212,7 +211,7 @@ class _NoiseSearch:
             best, predicted = self._step(best, range(best.theta.size))
             gain = before - best.loss
             # A gain as predicted means that the loss is quadratic here, so the optimum is reached.
-            if gain < CONVERGED_GAIN or abs(gain - predicted) < 0.5 * CONVERGED_GAIN:
+            if gain < 0.2 or abs(gain - predicted) < 0.1:  # of log likelihood
                 break
         return best
 
@@ -306,7 +305,8 @@ def initial_sensor_sd(column: Array) -> float:
         column: measurements, shape (rows,); NaN where missing.
     """
     third = np.abs(np.diff(column[np.isfinite(column)], n=3))
-    return float(np.median(third)) / _MEDIAN_THIRD_DIFFERENCE if third.size else 0.0
+    # The median size of third differences of white noise of unit variance.
+    return float(np.median(third)) / (0.6745 * sqrt(20.0)) if third.size else 0.0
 
 
 def resolution(values: Array) -> float:

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 _FILE_SUFFIX = re.compile(r"\.[A-Za-z][A-Za-z0-9]{1,6}")
 """A new folder has no such suffix, which looks like that of a file."""
 
-_HEAD_BYTES = 65_536
+_HEAD_BYTES = 65_536  # more than any header has
 
 
 def check_output_file(path: Path, sources: Iterable[Path | None] = (), *, force: bool = False) -> Path:
@@ -317,7 +317,7 @@ TIME_COLUMN, RUN_COLUMN, CLOCK_COLUMN = "time_min", "run", "time"
 """Columns beside the signals: minutes, the run of each row if there are several, and clock time if it is asked for."""
 
 WRITTEN_SUFFIXES = (".csv", ".gz", ".xlsx", ".parquet")
-MAX_SHEET_ROWS = 1_048_576
+MAX_SHEET_ROWS = 1_048_576  # of Excel since 2007
 
 
 def write_table(path: Path, record: "Record", *, clock: bool = False) -> None:

@@ -79,7 +79,7 @@ def promise_per_30_days(asked: float | None, alarms: int, period_min: float) -> 
         InputError: charts cannot keep what is asked for.
     """
     rows = DAYS_MIN / period_min * alarms
-    fewest, most = rows / LONGEST_DESIGN, rows / (SHORTEST_ARL0)
+    fewest, most = rows / LONGEST_DESIGN, rows / SHORTEST_ARL0
     if asked is None:
         return min(max(USUAL_PER_30_DAYS, fewest), most)
     if not fewest <= asked <= most:

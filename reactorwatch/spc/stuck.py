@@ -48,9 +48,6 @@ SMALLEST = 5
 MOVEMENT_STEPS = 8
 """Steps in the mean that shows whether the signal was moving."""
 
-AT_REST = 0.25
-"""Share of the mean step in the quietest interval of the training: with less, the plant was coming to rest."""
-
 CONFIDENCE = 0.95
 """Confidence of the bounds on shares."""
 
@@ -117,7 +114,7 @@ def take_reading(p: Any, value: float) -> bool:
 @jit
 def allowed_readings(p: Any) -> float:
     """Most equal readings in a row; infinite if the signal came to rest before them."""
-    moved = p.step_count == MOVEMENT_STEPS and movement(p) >= AT_REST * p.quietest
+    moved = p.step_count == MOVEMENT_STEPS and movement(p) >= 0.25 * p.quietest
     return float(p.limit) if moved else inf
 
 

@@ -5,8 +5,8 @@ signals with their units and roles, and its equations) and one of each gap: mess
 their messages (`reactorwatch.runtime.reorder_buffer`), so the number and the range of lost messages is known.
 
 Equations of the catalogue are stored by name, with the constants that differ and the deviations that the model holds,
-and other ones as data (`stored_equations`). Effects of a user's code are neither: a recording of a process that has
-some is read with the process named by an option.
+and other ones as data (`process.extended_model`). Effects of a user's code are neither: a recording of a process that
+has some is read with the process named by an option.
 """
 
 from collections.abc import Iterable

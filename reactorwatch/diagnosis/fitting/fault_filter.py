@@ -18,12 +18,11 @@ from reactorwatch.diagnosis.fitting.measurement_delay import ShiftedRun, restore
 from reactorwatch.diagnosis.fitting.profiles import Signal
 from reactorwatch.diagnosis.run import Run, input_uncertainty_of
 from reactorwatch.kalman.batch import (
-    STEPS_PER_EVALUATION,
-    STEPS_PER_LINEARISATION,
     FilterRecord,
     FilterResult,
     ResampledRecord,
     StepBudget,
+    StepCost,
     count_pieces,
     insert_rows,
     run_together,
@@ -207,7 +206,7 @@ class FaultFilter:
             shared: for each set, a run with the same first rows or None; None: no such runs.
         """
         laid = [self._lay_out_rows(run, signals) for signals in several]
-        self.spend(sum(STEPS_PER_EVALUATION + rows.time_min.size // 10 for rows, _ in laid))
+        self.spend(sum(StepCost.EVALUATION + rows.time_min.size // 10 for rows, _ in laid))
         # With a delayed output the filter's rows depend on the delay, so no prefix is shared.
         prefixes = [None] * len(laid) if shared is None or self.delay_index is not None else shared
         innovations = self._filter_rows([rows for rows, _ in laid], prefixes)
@@ -289,7 +288,7 @@ class FaultFilter:
 
     def error_dynamics(self, run: Run, signals: Sequence[Signal], innovations: FilterResult) -> ErrorDynamics:
         """Error equations about a filter run, from the second row on, the first one that is predicted."""
-        self.spend(STEPS_PER_LINEARISATION + int(1.5 * np.sum(count_pieces(run.time_min))))
+        self.spend(StepCost.LINEARISATION + int(1.5 * np.sum(count_pieces(run.time_min))))
         return error_dynamics_between(self._errors, run, self.inputs(run, signals), innovations, self.used_values(run))
 
     def used_values(self, run: Run) -> NDArray[np.bool_]:

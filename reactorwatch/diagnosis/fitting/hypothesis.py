@@ -21,7 +21,7 @@ from reactorwatch.diagnosis.fitting.fault_filter import FaultFilter, SharedPrefi
 from reactorwatch.diagnosis.fitting.profiles import FittedProfile, Signal
 from reactorwatch.diagnosis.parameter_priors import last_finite_row, offsets
 from reactorwatch.diagnosis.run import Run
-from reactorwatch.kalman.batch import STEPS_PER_COVARIANCE, FilterResult
+from reactorwatch.kalman.batch import FilterResult, StepCost
 from reactorwatch.kalman.error_dynamics import ErrorDynamics
 
 CONVERGED, WELL_CONVERGED = 0.05, 0.005
@@ -223,7 +223,7 @@ class Hypothesis:
 
     def _covariance(self, g: Array) -> Array:
         """Covariance of the parameters from their Jacobian."""
-        self.filter.spend(STEPS_PER_COVARIANCE)
+        self.filter.spend(StepCost.COVARIANCE)
         information = g.T @ g + self._prior_information()
         return inverse(information)
 

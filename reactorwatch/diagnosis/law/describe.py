@@ -21,9 +21,8 @@ from reactorwatch.diagnosis.parameter_priors import add_priors
 from reactorwatch.diagnosis.result import LISTED, Estimate, HeldOut, Law, LawCurve, RivalLaw
 from reactorwatch.diagnosis.run import Run
 from reactorwatch.diagnosis.search.search import FittedHypothesis
-from reactorwatch.process.law import ExtendedLaw, find_form
+from reactorwatch.process.law import CAPACITY, FACTOR, INPUT, SOURCE, ExtendedLaw, find_form, unit_of, unit_of_variable
 from reactorwatch.process.model import Place, ProcessModel
-from reactorwatch.process.places import CAPACITY, FACTOR, INPUT, SOURCE, unit_of, unit_of_variable
 
 BINS = 30
 """Number of points of a curve, each the mean of as many rows."""

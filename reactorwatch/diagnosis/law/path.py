@@ -8,8 +8,8 @@ import numpy as np
 
 from reactorwatch.arrays import Array
 from reactorwatch.diagnosis.run import Run
+from reactorwatch.process.law import variable_expression
 from reactorwatch.process.model import Place, ProcessModel
-from reactorwatch.process.places import variable_expression
 
 
 @dataclass(frozen=True)

@@ -18,9 +18,8 @@ from reactorwatch.arrays import Array
 from reactorwatch.diagnosis.law.feedback import Answers
 from reactorwatch.diagnosis.law.path import Scale, evaluate_along
 from reactorwatch.process.effect import Effect, ParameterShift
-from reactorwatch.process.law import add_lag_states
+from reactorwatch.process.law import CAPACITY, FACTOR, SENSOR, add_lag_states, correct, find_place, variable_expression
 from reactorwatch.process.model import MODEL_CACHE_SIZE, Parameter, Place, ProcessModel
-from reactorwatch.process.places import CAPACITY, FACTOR, SENSOR, correct, find_place, variable_expression
 
 HINGES = (-0.7, 0.0, 0.7)
 """Positions of hinges, in spreads from the mean."""

@@ -24,9 +24,8 @@ from reactorwatch.diagnosis.law.path import Scale, scales_along, variables_along
 from reactorwatch.diagnosis.law.shapes import Shape, make_shape
 from reactorwatch.diagnosis.run import Run
 from reactorwatch.diagnosis.whiteness import DOUBTFUL, minus_log10_p
-from reactorwatch.process.law import ExtendedLaw
+from reactorwatch.process.law import ExtendedLaw, places_of
 from reactorwatch.process.model import Place, ProcessModel
-from reactorwatch.process.places import places_of
 
 FIRST_STEPS, STEPS = 2, 4
 """Gauss-Newton steps with the nominal filter's process noise, and without."""

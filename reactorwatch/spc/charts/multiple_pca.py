@@ -23,12 +23,6 @@ from reactorwatch.spc.charts.base import Setting
 from reactorwatch.spc.charts.pca import Components, standardise
 from reactorwatch.spc.charts.value_chart import Model, StatisticsChart, ValueBaseline
 
-RIDGE = 1e-3
-"""Share of the variance of all rows that each regime has at least, in every direction."""
-
-SEED = 20_261_123
-"""Seed of the first of the starts, which are always the same ones."""
-
 
 class Mixture(NamedTuple):
     """Gaussian mixture.
@@ -48,7 +42,7 @@ class Mixture(NamedTuple):
         """The mixture that is most likely, given memberships of shape (rows, regimes)."""
         counts = memberships.sum(axis=0)
         means = memberships.T @ rows / counts[:, None]
-        ridge = RIDGE * np.diag(rows.var(axis=0))
+        ridge = 1e-3 * np.diag(rows.var(axis=0))  # least variance of a regime, of that of all rows, in every direction
         off = rows[None] - means[:, None]
         covariances = np.einsum("ng,gni,gnj->gij", memberships, off, off) / counts[:, None, None] + ridge
         return cls(counts / len(rows), means, np.linalg.inv(np.linalg.cholesky(covariances)))
@@ -81,7 +75,8 @@ def fit_mixture(rows: Array, regimes: int, fewest: float) -> Mixture:
     least = _bic(best, rows)
     for count in range(2, regimes + 1):
         for start in range(4):
-            mixture = maximise(rows, divide(rows, count, np.random.default_rng(SEED + start)), fewest)
+            rng = np.random.default_rng(20_261_123 + start)  # always the same starts
+            mixture = maximise(rows, divide(rows, count, rng), fewest)
             if mixture is not None and _bic(mixture, rows) < least:
                 best, least = mixture, _bic(mixture, rows)
     return best

@@ -21,12 +21,6 @@ from reactorwatch.spc.charts.value_chart import BLOCKS, Model, StatisticsChart, 
 STAGES = 20
 """Number of intervals of a batch; courses are linear within one."""
 
-FALL = 0.5
-"""Fall of the progress, as a share of its range, with which a new batch begins."""
-
-LEAST_SD = 0.1
-"""Least standard deviation at a stage, as a share of that over the whole batch."""
-
 
 class MultiwayPca(StatisticsChart):
     """T2 and SPE of the deviations from the mean course of a batch."""
@@ -70,7 +64,8 @@ class MultiwayPca(StatisticsChart):
         means = smooth_courses(basis, x)
         total = x.std(axis=0, ddof=1)
         squares = smooth_courses(basis, (x - basis @ means) ** 2)
-        sds = np.sqrt(np.maximum(squares, (LEAST_SD * np.where(total > 0.0, total, 1.0)) ** 2))
+        # A stage has at least a tenth of the standard deviation of the whole batch.
+        sds = np.sqrt(np.maximum(squares, (0.1 * np.where(total > 0.0, total, 1.0)) ** 2))
         z = (x - basis @ means) / (basis @ sds)
         courses = {"is_progress": is_progress.astype(np.float64), "nodes": nodes, "courses": means, "course_sds": sds}
         return courses | Components.principal(z.T @ z / len(z))._asdict()
@@ -102,7 +97,7 @@ def progress_of(baseline: ValueBaseline) -> Array:
 
 def batch_starts(progress: Array) -> list[int]:
     """First row of each batch."""
-    falls = np.flatnonzero(np.diff(progress) < -FALL * np.ptp(progress)) + 1
+    falls = np.flatnonzero(np.diff(progress) < -0.5 * np.ptp(progress)) + 1  # a fall by half its range begins a batch
     starts: list[int] = [0, *falls.tolist()]
     return starts
 

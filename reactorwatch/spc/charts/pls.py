@@ -23,9 +23,6 @@ from reactorwatch.spc.charts.base import Setting, SignalSetting
 from reactorwatch.spc.charts.pca import Components, standardise
 from reactorwatch.spc.charts.value_chart import BLOCKS, Model, StatisticsChart, ValueBaseline
 
-MOST_COMPONENTS = 8
-"""Largest number of components; there is always one less than signals, so that something is left for SPE."""
-
 
 class Projection(NamedTuple):
     """Components of signals that predict others.
@@ -123,8 +120,8 @@ class Pls(StatisticsChart):
 
 
 def choose_components(x: Array, y: Array) -> int:
-    """Number of components with the least squared error of prediction on held-out blocks; at most `MOST_COMPONENTS`."""
-    most = min(MOST_COMPONENTS, x.shape[1] - 1)
+    """Number of components with the least squared error of prediction on held-out blocks; at most 8."""
+    most = min(8, x.shape[1] - 1)  # one less than signals, so that something is left for SPE
     errors = np.zeros(most)
     for first, end in pairwise(np.linspace(0, len(x), BLOCKS + 1).astype(int).tolist()):
         others = np.r_[0:first, end : len(x)]

@@ -184,9 +184,6 @@ def shewhart_limit(arl0: float, rules: Iterable[int] = (1,)) -> float:
 State = tuple[tuple[int, ...], tuple[int, ...], int]
 """Sides of the last points beyond the inner line, of those beyond the middle line (0: not beyond), and the run."""
 
-ZONES = ((-3, -1), (-2, -1), (-1, -1), (0, -1), (0, 1), (1, 1), (2, 1), (3, 1))
-"""Zone and side of a point, from the lowest to the highest."""
-
 
 def shewhart_run_length(
     shift: float, width: float = 3.0, rules: Iterable[int] = (1,), *, steady_state: bool = False
@@ -254,7 +251,8 @@ def _transition_table(rules: tuple[int, ...]) -> list[list[int]]:
     while todo:
         state = todo.pop(0)
         targets = []
-        for zone, side in ZONES:
+        # Zone and side of a point, from the lowest to the highest.
+        for zone, side in ((-3, -1), (-2, -1), (-1, -1), (0, -1), (0, 1), (1, 1), (2, 1), (3, 1)):
             target = _next_state(state, zone, side, rules)
             if target is not None and target not in index:
                 index[target] = len(index)

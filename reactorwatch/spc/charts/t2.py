@@ -42,9 +42,6 @@ from reactorwatch.stored_state import Memory
 GRID = 2**13
 """Number of grid points of the convolution; the step is then about a thousandth of the quantile."""
 
-MOST_TURNED = 8
-"""Largest number of signals for which errors of correlations are drawn; of more, the limit has them on average."""
-
 
 class T2Memory(Memory):
     """Memory of a T2 chart: the arguments of `T2`."""
@@ -224,7 +221,8 @@ def joint_rates(known: float, weight: float, baseline: Baseline, errors: Trainin
     scale = np.column_stack([errors.true_scale(i, item, weight) for i, item in enumerate(learned)])
     factor = sqrt((2.0 - weight) / weight)
     mean = scale * errors.mean * factor / np.sqrt([float(item.rows) for item in learned])
-    turned = _correlation_errors(count, rows) if count <= MOST_TURNED else np.tile(np.eye(count), (DRAWS, 1, 1))
+    # Of more signals the limit has the errors of correlations on average.
+    turned = _correlation_errors(count, rows) if count <= 8 else np.tile(np.eye(count), (DRAWS, 1, 1))
     covariance = scale[:, :, None] * turned * scale[:, None, :]
     sizes, directions = np.linalg.eigh(covariance)
     shifts = np.einsum("dij,di->dj", directions, mean) / np.sqrt(sizes)

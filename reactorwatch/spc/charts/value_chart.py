@@ -32,17 +32,11 @@ from reactorwatch.spc.false_alarm_budget import TrainingErrors, degrees_of_freed
 from reactorwatch.spc.prewhitening import Prewhitening, learn
 from reactorwatch.stored_state import Memory
 
-FEWEST_SIGNALS = 8
-"""Least number of signals of a chart of values: with fewer the others say too little of each one."""
-
 BLOCKS = 5
 """Blocks of the cross-validation."""
 
 SHRINKAGE = 0.01
 """Share by which correlations are reduced: without it, signals that follow from others have no inverse."""
-
-NAMED = 3
-"""Signals that the text of an alarm names."""
 
 
 class ValueBaseline(NamedTuple):
@@ -76,7 +70,7 @@ class ValueChart(Chart):
 
     names: tuple[str, ...]
     locates: ClassVar[bool] = False
-    fewest_signals: ClassVar[int] = FEWEST_SIGNALS
+    fewest_signals: ClassVar[int] = 8  # with fewer the others say too little of each one
 
     @classmethod
     @abstractmethod
@@ -414,7 +408,7 @@ class StatisticsChart(ValueChart):
         gains = np.maximum(parts[largest], 0.0) + 1e-300
         order = np.argsort(-gains, kind="stable").tolist()
         shares = {self.names[i]: float(gains[i] / gains.sum()) for i in order}
-        named = " and ".join(f"{name} ({100 * share:.0f} %)" for name, share in list(shares.items())[:NAMED])
+        named = " and ".join(f"{name} ({100 * share:.0f} %)" for name, share in list(shares.items())[:3])
         text = (
             f"{self.labels[largest]} of the signals {self.reason}: on average {averages[largest]:.1f} sd above "
             f"that of the training (allowed: {self.limit:.1f} sd), most of it of {named}"

@@ -244,7 +244,7 @@ from monitor_node.causes.stage import preparation
 from reactorwatch.runtime.node_main import configure_log
 from reactorwatch.cli import kernels as compilation
 from reactorwatch.process.library.cstr import cstr
-from reactorwatch.codegen.cache import CodeCache
+from reactorwatch.codegen.compiled_function import CodeCache
 
 made, keep = [], CodeCache._store
 CodeCache._store = lambda self, path, code: made.append(path.name)

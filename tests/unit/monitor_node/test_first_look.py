@@ -17,10 +17,9 @@ from monitor_node.fleet import FleetConfig
 from monitor_node.node import MonitorNode
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
-from reactorwatch.codegen.array_function import ArrayFunction
-from reactorwatch.codegen.compiled_function import CompiledFunction
+from reactorwatch.codegen.compiled_function import ArrayFunction, CompiledFunction
 from reactorwatch.kalman import error_dynamics
-from reactorwatch.kalman.batch import STEPS_PER_SEARCH
+from reactorwatch.kalman.batch import StepCost
 from reactorwatch.kalman.ekf_step import compiled_row, predict_function, row_function
 from reactorwatch.kalman.filter_states import correction_function
 from reactorwatch.process.library.cstr import cstr
@@ -184,7 +183,7 @@ def test_a_look_takes_no_more_steps_where_rows_are_far_apart(period_min: float, 
     work.forget()
     isolation.suspects(rows, since_rows=100)
     spent, limit = isolation.budget.spent, LOOK_STEPS + LOOK_STEPS_A_ROW * ROWS
-    assert spent <= limit + STEPS_PER_SEARCH + MOST_PIECES + ROWS
+    assert spent <= limit + StepCost.SEARCH + MOST_PIECES + ROWS
     assert work.machine_rows + 3 * work.calls <= spent
 
 

@@ -17,9 +17,8 @@ from reactorwatch.arrays import Array
 from reactorwatch.errors import InputError
 from reactorwatch.process.library.cstr import cstr
 from reactorwatch.process.library.cstr_operation import LevelControl
-from reactorwatch.process.linearise import linearise
 from reactorwatch.process.model import ProcessModel, variable
-from reactorwatch.process.steady_state import steady_states
+from reactorwatch.process.steady_state import linearise, steady_states
 from tests.unit.plant_node.rows import QUIET
 
 ROWS = 4000

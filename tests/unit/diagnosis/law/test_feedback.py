@@ -11,8 +11,8 @@ from reactorwatch.diagnosis.law.feedback import find_answers
 from reactorwatch.diagnosis.law.shapes import make_shape
 from reactorwatch.diagnosis.law.unknown import start_places
 from reactorwatch.diagnosis.record_checks import make_run
+from reactorwatch.process.law import find_place
 from reactorwatch.process.library.cstr import cstr
-from reactorwatch.process.places import find_place
 from tests.hidden_effect.catalogue import named
 from tests.hidden_effect.draw import Hidden, draw
 from tests.hidden_effect.excitation import MEDIUM_NOISE, Circumstances

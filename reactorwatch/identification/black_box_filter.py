@@ -6,8 +6,8 @@ noise of the measurements, uncertainty of the state, and uncertainty of the para
 At a set point that the training has not seen the first rows have wide limits and teach; the errors of a parameter are
 the same in many rows, and only a filter that learns them makes the innovations independent, as charts need them.
 
-A row whose standard deviation is above `UNSEEN` times that of the training is an extrapolation. After an input took an
-unfamiliar value it is not judged, until `SETTLED` rows in succession are none. With familiar inputs the plant should
+A row whose standard deviation is above 1.3 times that of the training is an extrapolation. After an input took an
+unfamiliar value it is not judged, until 25 rows in succession are none. With familiar inputs the plant should
 not be there: such a row is judged with that limit as its standard deviation, and teaches nothing.
 
 While learning is off the uncertainty of the parameters stays in the variances (a consider filter: Schmidt 1966), and
@@ -30,13 +30,11 @@ from numpy.typing import NDArray
 
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.numba_kernel import Entry, jit
-from reactorwatch.identification.black_box.model import BlackBoxModel, predict_outputs
+from reactorwatch.identification.black_box_model import BlackBoxModel, predict_outputs
 from reactorwatch.stored_state import Memory
 
-UNSEEN = 1.3  # times the standard deviation of the training's innovations: more is an extrapolation
-SETTLED = 25  # rows in succession that are no extrapolation, after which the values of the inputs are familiar
 LARGEST_PREDICTION = 1e12  # of scaled signals, and of their sd, where the model diverges: the charts can still use them
-BINS, BIN_WIDTH = 64, 0.25  # intervals of the values of an input, and their width in its standard deviations
+BINS = 64  # intervals of the values of an input, each a quarter of its standard deviation wide
 MEMORY = 10_000  # rows after which a row is forgotten
 FLAGS = 3  # numbers at the start of a belief: learning flag, flag of unfamiliar inputs, rows since they settled
 HEAD = 7  # numbers at the start of the constants: outputs, inputs, lags, delay, terms, degree, rate of forgetting
@@ -46,7 +44,7 @@ FAILED, UNJUDGED, JUDGED = -1.0, 0.0, 1.0
 @jit
 def bin_of(value: float) -> int:
     """Index of the interval of a scaled input."""
-    return int(min(max(np.floor(value / BIN_WIDTH) + BINS // 2, 0.0), BINS - 1.0))
+    return int(min(max(np.floor(value / 0.25) + BINS // 2, 0.0), BINS - 1.0))
 
 
 @jit
@@ -154,7 +152,7 @@ def filter_row(
         if not is_within:
             verdict = UNJUDGED
         after[2] = after[2] + 1.0 if is_within else 0.0
-        if after[2] >= SETTLED:
+        if after[2] >= 25:  # the values of the inputs are familiar
             after[1] = 0.0
             if learns:
                 for i in range(n_u):
@@ -345,7 +343,7 @@ class BlackBoxFilter:
     def run(self, inputs: Array, outputs: Array, follows: NDArray[np.bool_]) -> tuple[Array, Array]:
         """Predict the rows of the training with its own parameters, then stand at its end, ready to learn.
 
-        The typical standard deviation of these rows becomes the one from which `UNSEEN` counts.
+        1.3 times the typical standard deviation of these rows becomes the limit beyond which a row is an extrapolation.
 
         Args:
             inputs: shape (rows, inputs).
@@ -375,7 +373,7 @@ class BlackBoxFilter:
         self.reset_parameters((theta, covariance))
         self.learning = True
         if np.isfinite(sds).any():
-            self.limit_sd = UNSEEN * np.nanmedian(sds, axis=0) / np.array(self.model.spreads[: self._p])
+            self.limit_sd = 1.3 * np.nanmedian(sds, axis=0) / np.array(self.model.spreads[: self._p])
         return residuals, sds
 
     @property

@@ -18,11 +18,13 @@ from numpy.typing import NDArray
 
 from reactorwatch.arrays import Array
 from reactorwatch.errors import InputError
-from reactorwatch.identification.black_box.model import BlackBoxModel, Shape, lagged_inputs
-from reactorwatch.identification.black_box.prediction_error import (
+from reactorwatch.identification.black_box_model import (
     NEXT,
     START,
+    BlackBoxModel,
     RowArrays,
+    Shape,
+    lagged_inputs,
     log_likelihood,
     prediction_errors,
 )
@@ -30,8 +32,6 @@ from reactorwatch.identification.black_box.prediction_error import (
 MOST_PARAMETERS = 90  # of all outputs; the filter's work grows with their square
 LARGEST_DEGREE = 3  # one more where that is likelier: with little noise a cubic is visibly wrong
 ROWS_A_PARAMETER = 4  # least number of measured values for each parameter
-PRIOR_SD = (1.0, 1.0, 0.17, 0.07, 0.03)  # of the parameters by degree, of scaled signals
-GAINS = (1.0, 0.6, 0.3, 0.1, 0.03, 0.0)
 MARGIN = 10.0  # of log-likelihood that a larger gain or degree must bring, and half of it noise of the process
 _LEAST_VARIANCE = 1e-8  # of the process, of that of the measurements
 
@@ -43,7 +43,7 @@ class Rows:
     Attributes:
         y: outputs, shape (rows, outputs); NaN where missing.
         u: lagged inputs, shape (rows, inputs lags).
-        kinds: kinds of the rows, see `prediction_error`.
+        kinds: kinds of the rows, see `START`.
         smallest: smallest variance of each output's measurements.
     """
 
@@ -163,7 +163,8 @@ def row_kinds(shape: Shape, y: Array, lagged: Array, follows: NDArray[np.bool_])
 def prior_variances(shape: Shape) -> Array:
     """Prior variances of the parameters, shape (parameters,)."""
     degrees = np.count_nonzero(shape.products() >= 0, axis=1)
-    return np.tile(np.square(PRIOR_SD)[degrees], shape.outputs)
+    # Standard deviations by degree, of scaled signals.
+    return np.tile(np.square((1.0, 1.0, 0.17, 0.07, 0.03))[degrees], shape.outputs)
 
 
 def _scaling(outputs: Array, inputs: Array) -> tuple[Array, Array]:
@@ -176,7 +177,7 @@ def _scaling(outputs: Array, inputs: Array) -> tuple[Array, Array]:
 def _fit_shape(shape: Shape, rows: Rows) -> _Fit:
     """Fit by rising degree: the fit of a degree starts that of the next."""
     best: _Fit | None = None
-    gains: tuple[float, ...] = GAINS
+    gains: tuple[float, ...] = (1.0, 0.6, 0.3, 0.1, 0.03, 0.0)
     for degree in range(1, shape.degree + 1):
         part = Shape(shape.outputs, shape.inputs, shape.lags, degree, shape.delay)
         start = np.zeros((part.outputs, part.terms))
