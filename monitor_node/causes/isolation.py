@@ -203,8 +203,8 @@ LARGEST_VARIANCE = 1.2
 
 _DUMMY_TIME_MIN = 0.1 * np.arange(4.0)
 
-_STEPS, _LAST_STEPS = 3, 8
-_HOLDS, _NOISE, _KEPT = 0.05, 5.0, 0.5
+_LAST_STEPS = 8  # most steps of a fit to all rows
+_HOLDS = 0.05  # share of its gain by which the linear estimate of a small fault may be off
 
 
 class Fitter:
@@ -249,7 +249,7 @@ class Fitter:
         segment = _Segment(self, window, 0, window.time_min.size, without_fault)
         predicted = best[0].gain
         gained = segment.loss_without_fault - segment.evaluate(best[0], best[0].parameters).loss
-        if not abs(gained - predicted) < _HOLDS * predicted + _NOISE:
+        if not abs(gained - predicted) < _HOLDS * predicted + 5.0:
             return self._follow(window, early, without_fault)
         fitted = best_first(segment.fit(item, first=True, steps=_LAST_STEPS) for item in best[:MOST])
         if log_evidence_of_residual(*fitted[0].residual(window)) > 0.0:
@@ -276,7 +276,7 @@ class Fitter:
         while end < times.size:
             segment, candidates = self._extend(progress, candidates, window, end, without_fault)
             first, end_min = progress.rounds == 0, float(times[end - 1])
-            candidates = best_first(segment.fit(item, first=first, steps=_STEPS) for item in candidates)
+            candidates = best_first(segment.fit(item, first=first, steps=3) for item in candidates)
             # The fewer rows a fit has seen, the farther it may be from its optimum.
             share = 0.5 if first else 0.1 if end_min - progress.onset_min < 100 * window.period_min else 0.05
             candidates = select_plausible(candidates, share)
@@ -366,7 +366,7 @@ class _Segment:
         start = self._centre_onset(candidate)
         if first:
             at_start = self.evaluate(candidate, start)
-            if self.loss_without_fault - at_start.loss < _KEPT * candidate.gain:
+            if self.loss_without_fault - at_start.loss < 0.5 * candidate.gain:
                 trials = [
                     self.evaluate(candidate, np.array([share * start[0], start[1]])) for share in ((0.5, 0.2, 0.08))
                 ]

@@ -151,7 +151,7 @@ PROFILES: tuple[type[FittedProfile], ...] = (Step, Ramp)
 ALL_PROFILES: tuple[type[FittedProfile], ...] = (*PROFILES, EndedRamp)
 """Profiles that are fitted."""
 
-_FIRST_ROWS = 6
+_FIRST_ROWS = 6  # rows after the onset of the first fit to a large fault
 
 
 @dataclass(frozen=True, eq=False)

@@ -30,7 +30,7 @@ from msgspec.structs import replace
 
 from monitor_node.config import MonitorConfig
 from monitor_node.ingest.rows import MeasuredRow
-from monitor_node.learn.references import Reference, RowPrediction
+from monitor_node.learn.references import COPY_ROWS, Reference, RowPrediction
 from reactorwatch.arrays import Array
 from reactorwatch.identification.data import Rows
 from reactorwatch.identification.rls import RecursiveLeastSquares, RlsMemory
@@ -46,9 +46,6 @@ MEMORY = 10_000
 
 JUDGING_FORGETTING = 1.0 - 1.0 / MEMORY
 """Least forgetting factor of an adaptive model that judges."""
-
-COPY_ROWS = 250
-"""Rows between two copies of an adaptive model that judges."""
 
 
 def arx_structure(config: MonitorConfig) -> Structure:

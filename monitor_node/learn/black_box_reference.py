@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 
 from monitor_node.ingest.rows import TOLERANCE, MeasuredRow, regular_intervals
-from monitor_node.learn.references import FilterReference, Reference, RowFilter, RowPrediction
+from monitor_node.learn.references import COPY_ROWS, FilterReference, Reference, RowFilter, RowPrediction
 from monitor_node.learn.training_rows import RowArrays
 from reactorwatch.arrays import Array
 from reactorwatch.contract.messages_pb2 import ModelSnapshot, Parameter
@@ -23,9 +23,6 @@ from reactorwatch.kalman.batch import GATE
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MINUTE_NS
 from reactorwatch.stored_state import Memory, copy_of
-
-COPY_ROWS = 250
-"""Rows between two copies of the parameters."""
 
 UNFAMILIAR = {
     "black-box": "rows are not judged while inputs have values that the black box has not learned, and teach it"

@@ -17,6 +17,9 @@ from reactorwatch.contract.messages_pb2 import ModelSnapshot
 from reactorwatch.kalman.ekf_step import NoiseLevels
 from reactorwatch.process.model import ProcessModel
 
+COPY_ROWS = 250
+"""Rows between two copies of a model that learns: the end of learning takes back at least so many rows."""
+
 
 class RowPrediction(NamedTuple):
     """One-step-ahead prediction of a row.

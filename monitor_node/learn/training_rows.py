@@ -210,8 +210,6 @@ def _intervals(disturbed: Mask) -> list[tuple[int, int]]:
 ROWS_AFTER = 5
 """Rows after a move in which the residual is compared."""
 
-_QUANTILE, _NORMAL_QUANTILE = 0.97, 2.17
-
 
 class AfterMoves(NamedTuple):
     """Residuals after the largest moves of the inputs.
@@ -259,7 +257,7 @@ def compare_after_moves(e: Array, inputs: Array) -> AfterMoves:
         after, others = column[known & moved], column[known & ~moved]
         if min(len(after), len(others)) < 5:
             continue
-        size = float(np.quantile(np.minimum(after, 10.0), _QUANTILE)) / _NORMAL_QUANTILE
+        size = float(np.quantile(np.minimum(after, 10.0), 0.97)) / 2.17  # that of a standard normal variable
         if size > found.size and probability_of_larger(after, others) < 0.003 / e.shape[1]:
             found = AfterMoves(size, share)
     return found

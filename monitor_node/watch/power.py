@@ -42,7 +42,7 @@ RUNS = 2
 MOST_ROWS = 600
 """Rows after an onset that are computed; later ones are like their later half."""
 
-FEWEST_ROWS = 20
+FEWEST_ROWS = 20  # a training of fewer than two such halves states no power
 
 
 class Deviation(NamedTuple):

@@ -35,7 +35,7 @@ MODEL_IS_PROCESS: OlderKeys = types.MappingProxyType({"model": ("process", lambd
 PROTOCOLS = ("tcp", "tls", "udp", "ws")
 """Protocols of an endpoint."""
 
-LAST_PORT = 65535
+LAST_PORT = 65535  # 16 bits
 
 MAX_SPAN_S = 2.0**62 / 1e9
 """146 years: sums of times must still fit 64 bits of nanoseconds."""

@@ -27,7 +27,7 @@ MAX_DRAIN_FACTOR = 10
 MAX_INBOX_MESSAGES = 100_000
 MAX_INBOX_BYTES = 64 << 20  # of payload
 """Beyond either the bus's thread is blocked, and with it the publishers that are too fast for the node."""
-POLL_S = 0.1
+POLL_S = 0.1  # a person does not notice it
 _END = b"\0"  # no signal has this number
 BATCH = 256  # messages after which no further item is handled before the loop reads the clock again
 

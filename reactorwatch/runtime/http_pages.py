@@ -244,10 +244,10 @@ def serve_metrics(config: MetricsConfig, metrics: Metrics) -> Iterator[Metrics |
         server_thread.join()
 
 
-REQUEST_TIMEOUT_S = 10.0
+REQUEST_TIMEOUT_S = 10.0  # so that half-open connections do not add up
 MAX_HEAD = 1 << 16
 """Bytes of the head of a request; http.client has the same limit for a line."""
-BLOCK = 1 << 16
+BLOCK = 1 << 16  # bytes that are passed on at once
 PRIVATE = ("local", "localhost", "internal", "lan", "home.arpa")
 """Ends of names that only a local network resolves (RFC 6761, 6762, 8375; ICANN reserved `internal` in 2024)."""
 STATUS = "421 Misdirected Request"

@@ -301,7 +301,7 @@ def choose_executor(processes: int | None = None, scheduler: str | None = None) 
     return SerialExecutor() if processes == 1 else ProcessExecutor(processes)
 
 
-CONNECT_WITHIN_S = 10.0
+CONNECT_WITHIN_S = 10.0  # a wrong address is reported while its user waits
 WORKERS_WITHIN_S = 60.0  # a worker on a busy machine takes half a minute to start
 
 

@@ -37,7 +37,7 @@ from reactorwatch.runtime.reorder_buffer import Gap, ReorderBuffer
 
 log = structlog.get_logger()
 
-HEARTBEAT_S = 0.5
+HEARTBEAT_S = 0.5  # of a publisher, by which a subscriber notices that the last messages are missing
 PRIORITY = zenoh.Priority.DATA_HIGH
 """Above Zenoh's default, so that publishers that are no nodes do not fill the queues of a link."""
 MAX_INCIDENTS = 100
@@ -47,7 +47,7 @@ MAX_NEW_KEYS, NEW_KEYS_PER_S = 1000, 100
 
 LAST = "_max=1"
 """Selector of the last message that a publisher caches on each key."""
-HISTORY_WITHIN_S = 10.0
+HISTORY_WITHIN_S = 10.0  # in which Zenoh, too, gives a query up
 LAST_QUERY_PERIOD_S = 20.0
 """Period of queries for the last number on each key, on a bus with certificates.
 

@@ -208,7 +208,7 @@ def release_large_blocks() -> bool:
     return mallopt is not None and mallopt(-3, LARGE_BYTES) == 1
 
 
-LOG_EVERY_NS = 1_000_000_000
+LOG_EVERY_NS = 1_000_000_000  # a line of the log a second, however many messages are refused
 DECISIONS = "error,zenoh::net::routing::interceptor::access_control=trace"
 _COLOUR = re.compile(rb"\x1b\[[0-9;]*m")
 _DECISION = re.compile(b"routing::interceptor::access_control")

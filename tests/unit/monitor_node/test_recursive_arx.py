@@ -5,7 +5,7 @@ import pytest
 
 from monitor_node.config import ReferenceName
 from monitor_node.core import Monitor
-from monitor_node.learn.arx import COPY_ROWS
+from monitor_node.learn.references import COPY_ROWS
 from reactorwatch.arrays import Array
 from reactorwatch.contract.codec import Publication
 from reactorwatch.contract.messages_pb2 import Estimate, ModelSnapshot

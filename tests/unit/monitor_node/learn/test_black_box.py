@@ -8,7 +8,8 @@ import pytest
 
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
-from monitor_node.learn.black_box_reference import COPY_ROWS, BlackBoxReference
+from monitor_node.learn.black_box_reference import BlackBoxReference
+from monitor_node.learn.references import COPY_ROWS
 from monitor_node.replay import backtest
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication, encode
