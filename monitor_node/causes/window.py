@@ -45,7 +45,6 @@ class RecentRows(Memory):
         n_inputs: number of inputs.
         columns: numbers of a row: time in minutes, inputs, outputs.
         most: number of rows that are kept.
-        # the oldest are removed together, since that moves all others
         numbers: the rows one after the other, oldest first; up to 64 more than are kept.
     """
 
@@ -67,6 +66,7 @@ class RecentRows(Memory):
         if not is_later:
             del self.numbers[:]
         self.numbers.extend(row)
+        # the oldest are removed together, since that moves all others
         if len(self.numbers) > (self.most + 64) * self.columns:
             self.keep(self.most)
         return is_later

@@ -13,7 +13,7 @@ from reactorwatch.contract import keys
 from reactorwatch.contract.codec import OTHER_VERSION, DecodeError, Encoded, Publication, decode
 from reactorwatch.contract.messages_pb2 import Quality, Sample
 from reactorwatch.errors import InputError
-from reactorwatch.records.record import LARGEST_VALUE as LARGEST_VALUE
+from reactorwatch.records.record import LARGEST_VALUE
 from reactorwatch.stored_state import Memory
 from reactorwatch.units import conversion
 

@@ -87,11 +87,6 @@ class Reference(ABC):
     def typical_sd(self) -> list[float]:
         """Median standard deviation of each residual, in the outputs' units; 1 if unknown."""
 
-    @property
-    def filter(self) -> "FilterReference | None":
-        """The reference itself, if it is a filter whose rows the compiled step can take."""
-        return None
-
     # --- rows ------------------------------------------------------------------------------------------------
 
     @abstractmethod
@@ -156,11 +151,6 @@ class FilterReference(Reference):
         """See `Reference`."""
         sds: list[float] = self.memory.typical_sd
         return sds
-
-    @property
-    def filter(self) -> "FilterReference":
-        """See `Reference`."""
-        return self
 
     @property
     def last_inputs(self) -> tuple[float, ...]:

@@ -184,7 +184,7 @@ def _biases(watch: Watch, arrays: RowArrays) -> list[Deviation]:
         if responses is not None:
             paths[0, :, index] = np.nan_to_num(responses[index])
         if usual is not None:
-            size, runs = 1.0 * reference.typical_sd[index], []
+            size, runs = reference.typical_sd[index], []
             for onset in onsets:
                 shifted = measured.copy()
                 shifted[onset:, index] += size
@@ -192,12 +192,8 @@ def _biases(watch: Watch, arrays: RowArrays) -> list[Deviation]:
                 change = (np.asarray(found_shifted) - usual) / size
                 runs.append(np.nan_to_num(change[onset : onset + rows]))
             paths = np.stack(runs)
-        found.append(_bias(watch, name, paths))
+        found.append(Deviation(f"{name}.bias", watch.units.get(name, ""), np.inf, _prewhiten(watch, paths)))
     return found
-
-
-def _bias(watch: Watch, name: str, z: Array) -> Deviation:
-    return Deviation(f"{name}.bias", watch.units.get(name, ""), np.inf, _prewhiten(watch, z))
 
 
 def _prewhiten(watch: Watch, z: Array) -> Array:
