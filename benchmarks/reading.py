@@ -15,8 +15,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from benchmarks.harness.timing import fastest
-from reactorwatch.description.find import find_process
-from reactorwatch.description.read import read_process_table
+from reactorwatch.description.read import find_process, read_process_table
 from reactorwatch.records.record import Record
 from reactorwatch.records.write import write_table
 

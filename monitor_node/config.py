@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple,
 import msgspec
 
 from reactorwatch.contract.keys import DEFAULT_PLANT, check_plant
-from reactorwatch.description.find import find_process
+from reactorwatch.description.read import find_process
 from reactorwatch.runtime.config import check_bounds
 from reactorwatch.spc.charts.base import Setting, SignalSetting
 from reactorwatch.spc.charts.catalogue import CHARTS, chart

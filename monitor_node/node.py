@@ -17,7 +17,6 @@ from monitor_node.health import NODE, OtherMonitors
 from monitor_node.learn.training_diagnosis import read_equations
 from monitor_node.state_files import RESUMED, StateStore
 from reactorwatch.contract import keys
-from reactorwatch.contract.alarm_text import state_word
 from reactorwatch.contract.codec import Encoded, Publication
 from reactorwatch.contract.messages_pb2 import Alarm, AlarmKpis, Baseline, CommandReply, Health, Incident
 from reactorwatch.errors import InputError
@@ -26,6 +25,7 @@ from reactorwatch.runtime.acl import is_query
 from reactorwatch.runtime.bus import Bus
 from reactorwatch.runtime.http_pages import Metrics
 from reactorwatch.runtime.start import instance_name
+from reactorwatch.sentences.alarm import state_word
 
 log = structlog.get_logger()
 

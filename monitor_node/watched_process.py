@@ -19,8 +19,8 @@ from monitor_node.config import (
     WITHOUT_EQUATIONS,
     MonitorConfig,
 )
-from reactorwatch.description.find import find_process
 from reactorwatch.description.process import Process, Signal
+from reactorwatch.description.read import find_process
 from reactorwatch.errors import InputError, describe_unknown
 from reactorwatch.process.model import ProcessModel, Variable
 from reactorwatch.units import conversion

@@ -17,9 +17,6 @@ from recorder.core import COMMANDS, NODE
 from recorder.node import RecorderNode
 from recorder.recording_files import RecordingFiles, file_names, free_bytes
 
-HISTORY_MARGIN_NS = 10_000_000_000
-"""Largest delay from publication, which dates a message on the bus, to receipt, which dates it in a file."""
-
 
 def run(
     config: RecorderConfig,
@@ -54,7 +51,8 @@ def record(
     Raises:
         InputError: as `run`.
     """
-    history_ns = round(bus_config.history_s * 1e9) + HISTORY_MARGIN_NS
+    # with a margin for the delay from publication, which dates a message on the bus, to receipt, which dates it here
+    history_ns = round((bus_config.history_s + 10.0) * 1e9)
 
     def start() -> tuple[RecordingFiles, RecorderNode]:
         files, start_ns = RecordingFiles(config), time.time_ns()

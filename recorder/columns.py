@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 
 from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
-from reactorwatch.contract.alarm_text import NewSuspects
 from reactorwatch.contract.codec import Encoded
+from reactorwatch.contract.suspects import NewSuspects
 from reactorwatch.description.process import Process
 from reactorwatch.errors import InputError
 from reactorwatch.process import MODELS

@@ -53,7 +53,7 @@ class RecorderNode(Node):
         )
         own = [keys.key(config.plant, keys.ALARM, name) for name in PRIORITIES]
         self._channels = ChannelBudget(config.most_keys, (*own, keys.key(config.plant, keys.HEALTH, NODE)))
-        self._latched = LatchedMessages(self._channels.max_latched_messages)
+        self._latched = LatchedMessages(config.most_keys // 2)
         self._black_box = build_black_box(config)
         self._next_health_ns = self._next_retry_ns = start_ns
         missed = files.find_missed_intervals(self._black_box, start_ns)

@@ -6,12 +6,12 @@ The decisions when to flush, rotate, copy and delete are made in `recorder.keep`
 import contextlib
 import os
 import shutil
-import threading
+import time
 from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
-from queue import SimpleQueue
 from types import TracebackType
 from typing import Self
 
@@ -20,7 +20,7 @@ import structlog
 import tomli_w
 
 from reactorwatch.contract import keys
-from reactorwatch.description.find import PlantProcesses
+from reactorwatch.description.read import PlantProcesses
 from reactorwatch.errors import InputError
 from reactorwatch.records.write import make_folder
 from reactorwatch.runtime.reorder_buffer import Gap
@@ -30,9 +30,9 @@ from recorder.core import ReceivedMessage, fingerprint
 from recorder.files.ages import Ages, BootClock, read_boot_clock
 from recorder.files.copies import Window, cut, delete_partial_copies, find_orphans, list_damaged, repair
 from recorder.files.index import span_ns
-from recorder.files.metadata import FILE_INDEX, GAP, PROCESS, gap_metadata, process_metadata
 from recorder.files.part_file import PART, PartFile
 from recorder.files.reader import Reader, Wanted, select_topics
+from recorder.files.recording import FILE_INDEX, GAP, PROCESS, gap_metadata, process_metadata
 from recorder.files.writer import RecordingWriter, check_free, part_of
 from recorder.keep import (
     DAY_NS,
@@ -86,15 +86,14 @@ class RecordingFiles:
         self._plants: set[str] = set()  # with samples in the current file
         self._writer: RecordingWriter | None = None
         self._black_boxes = names.folder / BLACK_BOX
-        self._tasks = BackgroundTasks()
+        self._tasks = ThreadPoolExecutor(1, "background tasks")  # slow work on files, in its order
         self._file_count = 0
         self._previous = ""
         self._last_ns = 0
-        first = names.first(datetime.now(UTC))
         self._orphans = [] if not names.folder.is_dir() else find_orphans(names)  # repaired once a file is started
         delete_partial_copies(self._black_boxes, f"{names.stem}-")
         if not self._orphans:
-            check_free(first)
+            check_free(names.next(time.time_ns()))
         self._ages = Ages(names.folder / f".{names.stem}.ages", read_clock)
         self._ages.update((path.name, path.stat().st_mtime_ns) for path in self._deletable())
 
@@ -144,7 +143,7 @@ class RecordingFiles:
             self._writer.write(entry)
         log.info("recording", file=str(path))
         for part in self._orphans:
-            self._tasks.submit(f"recovering {part}", partial(repair, part))
+            self._submit(f"recovering {part}", partial(repair, part))
         self._orphans = []
         return path
 
@@ -258,7 +257,7 @@ class RecordingFiles:
 
     def save_black_box(self, interval: AlarmInterval) -> None:
         """Copy an interval into a file of its own, in the background; flush before."""
-        self._tasks.submit(f"the black box of {interval.alarm}", lambda: self._copy_black_box(interval))
+        self._submit(f"the black box of {interval.alarm}", lambda: self._copy_black_box(interval))
 
     def delete_oldest(self, protected_ns: int | None) -> None:
         """Delete recordings beyond the limits, in the background.
@@ -268,7 +267,7 @@ class RecordingFiles:
         """
         if self._limits != Limits():
             now_ns = self._ages.now_ns()
-            self._tasks.submit("deleting old recordings", lambda: self._delete_oldest(now_ns, protected_ns))
+            self._submit("deleting old recordings", lambda: self._delete_oldest(now_ns, protected_ns))
 
     def __enter__(self) -> Self:
         return self
@@ -279,7 +278,18 @@ class RecordingFiles:
         try:
             self.complete()
         finally:
-            self._tasks.finish()
+            self._tasks.shutdown()
+
+    def _submit(self, name: str, task: Callable[[], None]) -> None:
+        """Queue a task in the background; one that fails is logged by its name and never ends the recording."""
+
+        def work() -> None:
+            try:
+                task()
+            except (InputError, OSError) as error:
+                log.warning(f"{name} failed", why=str(error))
+
+        self._tasks.submit(work).add_done_callback(Future.result)  # it logs an error that is a fault of this software
 
     def _complete_files(self) -> list[Path]:
         if not self._names.folder.is_dir():
@@ -348,32 +358,3 @@ def free_bytes(folder: Path) -> int:
     """Free space on the disk of a folder, which may have been deleted."""
     folder = folder.absolute()
     return shutil.disk_usage(next(path for path in (folder, *folder.parents) if path.is_dir())).free
-
-
-class BackgroundTasks:
-    """Background thread for slow work on files; a failed task is logged and never ends the recording."""
-
-    def __init__(self) -> None:
-        self._queue: SimpleQueue[tuple[str, Callable[[], None]] | None] = SimpleQueue()
-        self._thread: threading.Thread | None = None
-
-    def submit(self, name: str, task: Callable[[], None]) -> None:
-        """Queue a task; `name` describes it in the log."""
-        if self._thread is None:
-            self._thread = threading.Thread(target=self._work, name="background tasks", daemon=True)
-            self._thread.start()
-        self._queue.put((name, task))
-
-    def finish(self) -> None:
-        """Wait until all tasks are done; none may be submitted afterwards."""
-        if self._thread is not None:
-            self._queue.put(None)
-            self._thread.join()
-
-    def _work(self) -> None:
-        while (item := self._queue.get()) is not None:
-            name, task = item
-            try:
-                task()
-            except (InputError, OSError) as error:
-                log.warning(f"{name} failed", why=str(error))

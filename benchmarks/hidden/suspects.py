@@ -7,7 +7,7 @@ import numpy as np
 import reactorwatch as rw
 from benchmarks.hidden.classes import NEARLY, find_class
 from monitor_node.causes.isolation import causes_of
-from reactorwatch.description.find import find_process
+from reactorwatch.description.read import find_process
 from tests.hidden_effect.catalogue import named
 from tests.hidden_effect.draw import CannotHideError, Hidden, draw
 

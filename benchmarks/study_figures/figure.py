@@ -1,8 +1,6 @@
-"""Figures of the study, their findings, and the paper that they are drawn on: matplotlib without a screen.
+"""Figures of the study and their findings, drawn in the style of `reactorwatch.figures`.
 
-The same drawing gives the same bytes: the style is set here in full, whatever the user's matplotlibrc says, the font
-is the one that matplotlib brings, and the file carries neither date nor version. Colours are those of Okabe & Ito
-(2008), Color Universal Design, which people with any kind of colour vision tell apart.
+The same drawing gives the same bytes. Colours are those of Okabe & Ito (2008), Color Universal Design.
 """
 
 import io
@@ -13,12 +11,12 @@ from enum import Enum
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure as Drawing
 from PIL import Image
 
+from reactorwatch.figures import DPI, figure_png, plain_style
 from reactorwatch.records.write import atomic_write
 
 if TYPE_CHECKING:
@@ -75,43 +73,23 @@ BLUE, ORANGE, GREEN, VERMILION = "#0072B2", "#E69F00", "#009E73", "#D55E00"
 SKY, PURPLE = "#56B4E9", "#CC79A7"
 BY_ORDER = {1: ORANGE, 2: BLUE, 3: VERMILION}
 
-DPI = 100
 WIDTH_PX = 900
 _PALETTE = 256  # colours in a file: a third of the bytes
-
-_STYLE: Any = {
-    "font.family": "DejaVu Sans",
-    "font.size": 9.5,
-    "axes.titlesize": 10,
-    "axes.titlelocation": "left",
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "grid.color": "#e4e4e4",
-    "grid.linewidth": 0.7,
-    "axes.axisbelow": True,
-    "axes.formatter.useoffset": False,
-    "lines.linewidth": 1.5,
-    "legend.fontsize": 8.5,
-    "legend.frameon": True,
-    "legend.framealpha": 0.85,
-    "legend.edgecolor": "none",
-    "figure.facecolor": "white",
-}
 
 
 @contextmanager
 def paper(path: Path, height_px: int) -> Iterator[Drawing]:
     """An empty drawing, which is written to `path` (PNG) when the block ends without an error."""
-    with matplotlib.rc_context():
-        matplotlib.rcdefaults()
-        matplotlib.rcParams.update(_STYLE)
+    with plain_style():
         drawing = Drawing(figsize=(WIDTH_PX / DPI, height_px / DPI), dpi=DPI, layout="constrained")
         FigureCanvasAgg(drawing)
         yield drawing
-        pixels = io.BytesIO()
-        drawing.savefig(pixels, format="png", dpi=DPI, metadata={"Software": None})
-    picture = Image.open(pixels).convert("RGB").quantize(_PALETTE, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
+        pixels = figure_png(drawing)
+    picture = (
+        Image.open(io.BytesIO(pixels))
+        .convert("RGB")
+        .quantize(_PALETTE, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
+    )
     with atomic_write(path) as temporary:
         picture.save(temporary, format="PNG", optimize=True)
 

@@ -31,7 +31,7 @@ from benchmarks.study_figures.figure import (
 from benchmarks.study_figures.report_scheme import chart_output
 from benchmarks.study_figures.study import Study
 from reactorwatch.arrays import Array
-from reactorwatch.description.find import find_process
+from reactorwatch.description.read import find_process
 
 ONSET, BIAS = 0.6, 0.1
 TITLE = "Measured records with added faults"

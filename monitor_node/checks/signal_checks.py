@@ -282,7 +282,7 @@ class SilenceCheck(SignalCheck):
 
 
 CHECKS: tuple[type[SignalCheck], ...] = (SilenceCheck, StuckCheck, SpikeCheck, RangeCheck)
-"""The signal checks. A new one: a class, and a name here."""
+"""The signal checks. A new one: a file beside this one, and a name here."""
 
 
 class SignalChecks:

@@ -27,7 +27,7 @@ from monitor_node.learn.process_reference import fit_training_noise, model_outpu
 from monitor_node.learn.training_rows import RowArrays, TrainingRows, screen_baseline
 from reactorwatch.arrays import Array
 from reactorwatch.contract.messages_pb2 import Baseline
-from reactorwatch.diagnosis.extended import extended_model
+from reactorwatch.diagnosis.estimates import extended_model
 from reactorwatch.diagnosis.result import AMBIGUOUS, NOMINAL, Cause, Diagnosis
 from reactorwatch.diagnosis.whiteness import minus_log10_p
 from reactorwatch.errors import InputError

@@ -30,14 +30,13 @@ from reactorwatch.contract.alarm_states import Event
 from reactorwatch.contract.codec import Publication
 from reactorwatch.contract.messages_pb2 import Alarm, Promise
 from reactorwatch.process.model import ProcessModel
+from reactorwatch.sentences.promise import describe_broken_promise, describe_promise
 from reactorwatch.spc import false_alarm_budget
-from reactorwatch.spc.false_alarm_budget import CONFIDENCE, DAYS, DAYS_MIN, QUANTILE
+from reactorwatch.spc.false_alarm_budget import QUANTILE
 from reactorwatch.stored_state import Memory, Storable
 
 UNLIKELY = 0.003
 """Probability of so many alarms by chance below which the promise is not kept."""
-
-REMEDY = "train longer, or over more set points"
 
 
 class TrainingCheck(Storable, msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -113,40 +112,15 @@ class PlantPromise(Memory):
     @property
     def warning(self) -> str:
         """Words for the text of an alarm where the promise is not kept; empty where it is."""
-        if self.is_kept:
-            return ""
-        return f"by its training, false alarms of this plant may come {describe_rate(self.can_keep_per_30_days)}"
+        return "" if self.is_kept else describe_broken_promise(self.can_keep_per_30_days, " of this plant")
 
     def text(self, rows: int) -> str:
         """One sentence for people, after a number of rows."""
-        check = self.check
-        if self.is_kept:
-            parts = [
-                f"false alarms in {DAYS} days: {self.per_30_days:.2g} on average, at most "
-                f"{self.upper_per_30_days:.2g} for this plant with {100 * CONFIDENCE:.0f} % confidence"
-            ]
-            parts.append(
-                f"in the second half of its training, judged by the first, {_count(check.found)}, "
-                f"{check.expected:.2g} promised"
-                if check.rows
-                else "the training was too short to be judged by itself"
-            )
-        else:
-            found = f"{_count(check.found)}, {check.expected:.2g} promised"
-            parts = [
-                (f"in the second half of its training, judged by the first, {found}: " if check.found else "")
-                + "this plant wanders, its model errs after moves of the inputs, or its training has not seen enough of"
-                f" it; from this training {describe_rate(self.can_keep_per_30_days)} can be promised; {REMEDY}"
-            ]
-        if self.found:
-            parts.append(f"{_count(self.found)} since, {self.mean_count(rows):.2g} promised")
-        if self.has_drifted(rows):
-            parts.append("if nothing is wrong, the plant has drifted from its training: train it again")
-        return "; ".join(parts)
+        return self.message(0, rows).text
 
     def message(self, time_ns: int, rows: int) -> Promise:
-        """The message on the bus."""
-        return Promise(
+        """The message on the bus, after a number of rows."""
+        message = Promise(
             time_ns=time_ns,
             expected=self.per_30_days,
             expected_90=self.upper_per_30_days,
@@ -155,30 +129,14 @@ class PlantPromise(Memory):
             expected_in_training=self.check.expected,
             kept=self.is_kept,
             can_keep_per_30_days=self.can_keep_per_30_days,
-            text=self.text(rows),
             rows=rows,
             found=self.found,
             expected_so_far=self.mean_count(rows),
             drifted=self.has_drifted(rows),
             power=Promise.FromString(self.power).power,
         )
-
-
-def _count(alarms: int) -> str:
-    return "1 alarm came" if alarms == 1 else f"{alarms or 'no'} alarms came"
-
-
-def describe_rate(per_30_days: float) -> str:
-    """A rate of alarms in words.
-
-    >>> describe_rate(1080.0), describe_rate(40.0), describe_rate(2.0)
-    ('1 in 40 min', '1 in 18 h', '1 in 15 days')
-    """
-    minutes = DAYS_MIN / per_30_days
-    for unit, size in (("min", 1.0), ("h", 60.0)):
-        if minutes < 100.0 * size:
-            return f"1 in {minutes / size:.2g} {unit}"
-    return f"1 in {minutes / 1440.0:.2g} days"
+        message.text = describe_promise(message)
+        return message
 
 
 def probability_of(found: int, expected: Array) -> float:

@@ -8,19 +8,20 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import msgspec
 
+from reactorwatch import html
 from reactorwatch.api.records import ProcessLike, check_signals, process_of
 from reactorwatch.api.report_origin import report_origin
-from reactorwatch.description.find import find_process
 from reactorwatch.description.process import Process
+from reactorwatch.description.read import find_process
 from reactorwatch.description.toml_file import add_description
 from reactorwatch.diagnosis.diagnose import diagnose as find_causes
 from reactorwatch.diagnosis.record_checks import make_run
 from reactorwatch.diagnosis.report.machine import report_object
+from reactorwatch.diagnosis.report.panels import outputs
 from reactorwatch.diagnosis.report.words import describe_causes, describe_size, describe_timing, describe_verdict
 from reactorwatch.diagnosis.result import Diagnosis
-from reactorwatch.notebook import html
-from reactorwatch.notebook.figures import MEASURED, MODEL, Line, Mark, Panel, draw_panels
-from reactorwatch.notebook.frames import frame_of_rows
+from reactorwatch.figures import draw
+from reactorwatch.optional import frame_of_rows
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.extended_model import parse_extended_model
 from reactorwatch.process.model import ProcessModel
@@ -33,8 +34,6 @@ if TYPE_CHECKING:
 
 COLUMNS = ("explanation", "delta_bic", "cause", "profile", "label", "location", "size", "size_sd", "unit", "onset_min")
 """Columns of the data frame."""
-
-AFTER = "#2ca02c"
 
 
 class Case(NamedTuple):
@@ -130,22 +129,7 @@ class DiagnosisResult(Diagnosis):
         Raises:
             InputError: matplotlib is not installed.
         """
-        curves, panels = self.curves, []
-        assert curves is not None, "a diagnosis of a record has curves"
-        for name, measured in curves.measured.items():
-            lines = [
-                Line("measured", curves.time_min, measured, MEASURED),
-                Line("simulation as it was", curves.time_min, curves.simulated_before[name], MODEL),
-            ]
-            if self.causes:
-                lines.append(Line("extended simulation", curves.time_min, curves.simulated_after[name], AFTER))
-            panels.append(Panel(f"{name}, {self.model.units[name]}", tuple(lines)))
-        marks = [
-            Mark(item.parameters["onset"].value + item.run_shift_min, item.label)
-            for item in self.causes
-            if "onset" in item.parameters
-        ]
-        return draw_panels(panels, marks)
+        return draw(outputs(self, self.model))
 
     def to_html(self, file: str | Path) -> None:
         """Write the report as one page.

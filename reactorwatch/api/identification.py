@@ -7,22 +7,20 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
+from reactorwatch import html
 from reactorwatch.api.page import write_page
 from reactorwatch.api.records import ProcessLike, process_of
-from reactorwatch.description.find import find_process
+from reactorwatch.description.read import find_process
 from reactorwatch.errors import InputError, describe_unknown
+from reactorwatch.figures import Line, Panel, draw
 from reactorwatch.identification.data import Dataset
 from reactorwatch.identification.identify import HeldOutRun, Identification, ModelForm, identify_and_run
-from reactorwatch.notebook import html
-from reactorwatch.notebook.figures import MEASURED, MODEL, Line, Panel, draw_panels
-from reactorwatch.notebook.frames import make_frame
+from reactorwatch.optional import make_frame
 from reactorwatch.records.record import Record
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from pandas import DataFrame
-
-STEP = "#2ca02c"
 
 
 class IdentificationResult(Identification, frozen=True, kw_only=True):
@@ -74,18 +72,21 @@ class IdentificationResult(Identification, frozen=True, kw_only=True):
         Raises:
             InputError: matplotlib is not installed.
         """
+        return draw(self._panels())
+
+    def _panels(self) -> list[Panel]:
         run, unit = self.run, self.record.units.get(self.output, "")
         lines = (
-            Line("measured", run.time, run.measured, MEASURED),
-            Line("free run", run.time, run.free, MODEL),
-            Line("one step", run.time, run.one_step, STEP),
+            Line("measured", run.time, run.measured),
+            Line("free run", run.time, run.free, "before"),
+            Line("one step", run.time, run.one_step, "after"),
         )
         errors = (
-            Line("free run", run.time, run.measured - run.free, MODEL),
-            Line("one step", run.time, run.measured - run.one_step, STEP),
+            Line("free run", run.time, run.measured - run.free, "before"),
+            Line("one step", run.time, run.measured - run.one_step, "after"),
         )
         in_unit = f", {unit}" if unit else ""
-        return draw_panels([Panel(f"{self.output}{in_unit}", lines), Panel(f"error{in_unit}", errors)])
+        return [Panel(f"{self.output}{in_unit}", lines), Panel(f"error{in_unit}", errors)]
 
     def to_html(self, file: str | Path) -> None:
         """Write the result with its figure as one page.
@@ -94,7 +95,7 @@ class IdentificationResult(Identification, frozen=True, kw_only=True):
             InputError: the file cannot be written.
         """
         title = f"{self.model.upper()} model of {self.output}: {self.record.name}"
-        write_page(file, title, self._repr_html_(), self.plot, self.record.name)
+        write_page(file, title, self._repr_html_(), self._panels(), self.record.name)
 
 
 def identify(

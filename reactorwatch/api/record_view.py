@@ -4,13 +4,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from reactorwatch.notebook import html
-from reactorwatch.notebook.figures import INPUT, MEASURED, MODEL, Line, Mark, Panel, draw_panels
-from reactorwatch.notebook.frames import make_frame
+from reactorwatch import html
+from reactorwatch.figures import Line, Mark, Panel
+from reactorwatch.optional import make_frame
 from reactorwatch.records.record import Record
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
     from pandas import DataFrame
 
 
@@ -41,7 +40,11 @@ def record_html(record: Record) -> str:
 
 
 def signal_panels(
-    record: Record, inputs: tuple[str, ...], simulated: Record | None = None, names: tuple[str, ...] | None = None
+    record: Record,
+    inputs: tuple[str, ...],
+    simulated: Record | None = None,
+    names: tuple[str, ...] | None = None,
+    marks: tuple[Mark, ...] = (),
 ) -> list[Panel]:
     """A panel for each signal, outputs first, with their simulation.
 
@@ -50,26 +53,15 @@ def signal_panels(
         inputs: names of its inputs.
         simulated: simulation in the same rows; None: there is none.
         names: signals that are shown; None: all.
+        marks: moments and spans in all panels.
     """
     shown = [name for name in record.columns if names is None or name in names]
-    panels = []
+    panels, x_title = [], f"min since {record.zero}" if record.zero else "min"
     for name in sorted(shown, key=lambda item: item in inputs):
         unit, is_input = record.units.get(name, ""), name in inputs
-        colour, label = (INPUT, name) if is_input else (MEASURED, "measured")
-        lines = [Line(label, record.continuous_min, record.columns[name], colour, is_input)]
+        kind, label = ("input", name) if is_input else ("after" if simulated is None else "measured", "measured")
+        lines = [Line(label, record.continuous_min, record.columns[name], kind, is_input)]
         if simulated is not None and not is_input and name in simulated.columns:
-            lines.append(Line("simulated", simulated.continuous_min, simulated.columns[name], MODEL))
-        panels.append(Panel(f"{name}, {unit}" if unit else name, tuple(lines)))
+            lines.append(Line("simulated", simulated.continuous_min, simulated.columns[name], "before"))
+        panels.append(Panel(f"{name}, {unit}" if unit else name, tuple(lines), marks, x_title))
     return panels
-
-
-def plot_record(
-    record: Record, inputs: tuple[str, ...], simulated: Record | None = None, marks: tuple[Mark, ...] = ()
-) -> "Figure":
-    """Time plots of all signals; arguments as for `signal_panels`, and marks in all of them."""
-    return draw_panels(signal_panels(record, inputs, simulated), marks, time_title(record))
-
-
-def time_title(record: Record) -> str:
-    """Title of the time axis."""
-    return f"min since {record.zero}" if record.zero else "min"

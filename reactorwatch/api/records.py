@@ -11,11 +11,11 @@ import numpy as np
 from reactorwatch.api.files import described_process
 from reactorwatch.api.files import record as read_file
 from reactorwatch.api.page import write_page
-from reactorwatch.api.record_view import plot_record, record_frame, record_html
-from reactorwatch.description.find import DEFAULT_PROCESS, find_process
+from reactorwatch.api.record_view import record_frame, record_html, signal_panels
 from reactorwatch.description.process import Process
-from reactorwatch.description.read import convert_to_process
+from reactorwatch.description.read import DEFAULT_PROCESS, convert_to_process, find_process
 from reactorwatch.errors import InputError, describe_unknown
+from reactorwatch.figures import Panel, draw
 from reactorwatch.process import MODELS
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.model import ProcessModel
@@ -110,7 +110,10 @@ class Record(MeasuredRecord):
         Raises:
             InputError: matplotlib is not installed.
         """
-        return plot_record(self, self.inputs)
+        return draw(self._panels())
+
+    def _panels(self) -> list[Panel]:
+        return signal_panels(self, self.inputs)
 
     def to_html(self, file: str | Path) -> None:
         """Write the ranges and plots of the signals as one page.
@@ -118,7 +121,7 @@ class Record(MeasuredRecord):
         Raises:
             InputError: the file cannot be written.
         """
-        write_page(file, self.name, self._repr_html_(), self.plot, self.name)
+        write_page(file, self.name, self._repr_html_(), self._panels(), self.name)
 
 
 def _check_arrays(

@@ -3,18 +3,18 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
 
-from reactorwatch.api.record_view import plot_record, record_html
+from reactorwatch import html
+from reactorwatch.api.record_view import record_html, signal_panels
 from reactorwatch.api.records import ProcessLike, Record, measured_fields, model_of, process_of
 from reactorwatch.arrays import Array
-from reactorwatch.diagnosis.impossible_values import check_values
-from reactorwatch.diagnosis.units import find_wrong_unit
+from reactorwatch.diagnosis.record_checks import check_values, find_wrong_unit
 from reactorwatch.errors import InputError
-from reactorwatch.notebook import html
+from reactorwatch.figures import Panel
 from reactorwatch.process import named_effects
 from reactorwatch.process.fault import parse_fault
 from reactorwatch.process.law import laws_of
@@ -23,9 +23,6 @@ from reactorwatch.process.simulate import Simulator
 from reactorwatch.process.steady_state import complete_state
 from reactorwatch.records.record import Record as MeasuredRecord
 from reactorwatch.records.record import join_runs
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 
 class Rmse(NamedTuple):
@@ -61,15 +58,10 @@ class Simulation(Record):
         rows = [(name, f"{item.value:.3g} {item.unit}") for name, item in self.rmse.items()]
         return record_html(self) + html.table(("output", "root mean square difference from the record"), rows)
 
-    def plot(self) -> "Figure":
-        """Plot the measured and the simulated signals.
-
-        Raises:
-            InputError: matplotlib is not installed.
-        """
+    def _panels(self) -> list[Panel]:
         if self.measured is None:
-            return super().plot()
-        return plot_record(self.measured, self.inputs, self)
+            return super()._panels()
+        return signal_panels(self.measured, self.inputs, self)
 
 
 def simulate(

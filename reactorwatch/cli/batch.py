@@ -19,8 +19,8 @@ import typer
 from reactorwatch.api.files import expand_folder
 from reactorwatch.arrays import Array
 from reactorwatch.cli.display import bar, format_rows, json_line, print_lines, print_report, task
-from reactorwatch.description.find import DEFAULT_CHOICE, ProcessChoice
-from reactorwatch.diagnosis.units import find_wrong_unit
+from reactorwatch.description.read import DEFAULT_CHOICE, ProcessChoice
+from reactorwatch.diagnosis.record_checks import find_wrong_unit
 from reactorwatch.errors import InputError, UnfitRecordError
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.decode import list_files, quote_formula

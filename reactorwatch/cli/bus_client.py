@@ -37,7 +37,7 @@ def load_recorder_settings(target: PlantOptions, level: int = logging.WARNING) -
 
 def observed_process(process: str | None, recorder: RecorderConfig) -> "Process | None":
     """Process of the plant that is observed."""
-    from reactorwatch.description.find import PlantProcesses, find_process
+    from reactorwatch.description.read import PlantProcesses, find_process
 
     return PlantProcesses(recorder.processes).find(recorder.plant) if process is None else find_process(process)
 

@@ -28,11 +28,10 @@ from reactorwatch.cli.processes import (
     write_node_settings,
 )
 from reactorwatch.contract import keys
-from reactorwatch.contract.alarm_text import suspects_text
 from reactorwatch.contract.codec import Encoded, decode
 from reactorwatch.contract.messages_pb2 import Alarm, Fault, Incident, Sample
-from reactorwatch.description.find import DEFAULT_PROCESS, find_process
 from reactorwatch.description.process import Process
+from reactorwatch.description.read import DEFAULT_PROCESS, find_process
 from reactorwatch.diagnosis.result import NAMED, Diagnosis
 from reactorwatch.errors import InputError
 from reactorwatch.process.effect import Effect
@@ -44,6 +43,7 @@ from reactorwatch.runtime.config import section
 from reactorwatch.runtime.event_loop import StopSignal, stop_on_signals
 from reactorwatch.runtime.http_pages import free_endpoint
 from reactorwatch.runtime.node_main import INTERRUPTED, configure_log
+from reactorwatch.sentences.alarm import suspects_text
 from reactorwatch.terminal import printable_lines
 from recorder.config import RecorderConfig
 from recorder.core import DISK_ALARM

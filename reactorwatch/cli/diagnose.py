@@ -21,12 +21,12 @@ from reactorwatch.arrays import Array
 from reactorwatch.cli.batch import SUMMARY, FileOptions, Job, JobKind, JobResult, Row, as_table, make_jobs
 from reactorwatch.cli.display import json_line
 from reactorwatch.cli.options import check_recording
-from reactorwatch.diagnosis.experiment.constraints import check_limits
+from reactorwatch.diagnosis.experiment.inputs import check_limits
 from reactorwatch.diagnosis.parameter_priors import parse_priors
 from reactorwatch.diagnosis.practical_significance import check_tolerance
 from reactorwatch.diagnosis.record_checks import make_run
 from reactorwatch.diagnosis.report.machine import as_object, report_object
-from reactorwatch.diagnosis.report.pictures import interval
+from reactorwatch.diagnosis.report.panels import interval
 from reactorwatch.diagnosis.report.plain import as_text
 from reactorwatch.diagnosis.result import SD_95, Cause, Curves, Diagnosis, Experiment
 from reactorwatch.errors import InputError, UnfitRecordError

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import msgspec
 
 from reactorwatch.cli.display import json_line
-from reactorwatch.description.find import DEFAULT_PROCESS, ProcessChoice, find_process
 from reactorwatch.description.process import Process
+from reactorwatch.description.read import DEFAULT_PROCESS, ProcessChoice, find_process
 from reactorwatch.errors import InputError, describe_unknown
 from reactorwatch.identification.data import Dataset
 from reactorwatch.identification.identify import Coefficients, Identification, ModelForm, identify

@@ -279,8 +279,7 @@ def causes(
     from reactorwatch.api.files import record_of_process
     from reactorwatch.cli.causes import as_json_text, as_matrix
     from reactorwatch.diagnosis.identifiability import identifiability
-    from reactorwatch.diagnosis.record_checks import make_run
-    from reactorwatch.diagnosis.usual_excitation import excite
+    from reactorwatch.diagnosis.record_checks import excite, make_run
 
     choice = chosen.choose()
     if record is None:

@@ -23,7 +23,7 @@ from reactorwatch.errors import InputError
 from reactorwatch.records.file_format import GUESS
 
 if TYPE_CHECKING:
-    from reactorwatch.description.find import ProcessChoice
+    from reactorwatch.description.read import ProcessChoice
 
 
 def up(
@@ -229,7 +229,7 @@ def view(
     from dataclasses import replace
 
     from reactorwatch.cli.bus_client import load_recorder_settings, observed_process
-    from reactorwatch.description.find import find_process
+    from reactorwatch.description.read import find_process
     from recorder.view.viewer import DisplayTarget, show
 
     if chosen.process is not None and target.config is None:

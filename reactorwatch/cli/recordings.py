@@ -263,8 +263,7 @@ def cut(
     """Copy a span of plant time out of a recording."""
     from recorder.files.copies import cut as copy
     from recorder.files.copies import sample_window
-    from recorder.files.metadata import ZERO_NS
-    from recorder.files.recording import Recording
+    from recorder.files.recording import ZERO_NS, Recording
     from recorder.tools.inspect import zero_ns_of
 
     from_ns = parse_span_ns(begin, "--from") if begin is not None else -(2**63)

@@ -1,8 +1,8 @@
 """`up`: run the router in this process and the nodes as processes, until stopped."""
 
 import contextlib
+import time
 from collections.abc import Iterator, Sequence
-from datetime import UTC, datetime
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -29,7 +29,7 @@ from reactorwatch.cli.processes import (
     write_node_settings,
     write_settings,
 )
-from reactorwatch.description.find import DEFAULT_PROCESS, find_process
+from reactorwatch.description.read import DEFAULT_PROCESS, find_process
 from reactorwatch.diagnosis.practical_significance import check_tolerance
 from reactorwatch.errors import InputError
 from reactorwatch.limits import limits
@@ -136,7 +136,7 @@ def _write_settings(
     """Write the settings beside the recordings, under the same name; returns each node's file."""
     out = Path(recorder.out)
     make_folder(out.parent if out.suffix == ENDING and not out.is_dir() else out, "--out")
-    recording = file_names(recorder).first(datetime.now(UTC))
+    recording = file_names(recorder).next(time.time_ns())
     if recording.exists():
         raise InputError(f"--out {out}: a recording of that name exists; choose another name, or a folder")
     recorder = msgspec.structs.replace(recorder, about={**about, **recorder.about})

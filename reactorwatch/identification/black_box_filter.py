@@ -38,7 +38,7 @@ BINS = 64  # intervals of the values of an input, each a quarter of its standard
 MEMORY = 10_000  # rows after which a row is forgotten
 FLAGS = 3  # numbers at the start of a belief: learning flag, flag of unfamiliar inputs, rows since they settled
 HEAD = 7  # numbers at the start of the constants: outputs, inputs, lags, delay, terms, degree, rate of forgetting
-FAILED, UNJUDGED, JUDGED = -1.0, 0.0, 1.0
+FAILED, UNJUDGED, JUDGED = -1.0, 0.0, 1.0  # above zero if the row is judged, as in `ekf_step`
 
 
 @jit

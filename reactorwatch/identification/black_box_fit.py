@@ -30,10 +30,8 @@ from reactorwatch.identification.black_box_model import (
 )
 
 MOST_PARAMETERS = 90  # of all outputs; the filter's work grows with their square
-LARGEST_DEGREE = 3  # one more where that is likelier: with little noise a cubic is visibly wrong
 ROWS_A_PARAMETER = 4  # least number of measured values for each parameter
 MARGIN = 10.0  # of log-likelihood that a larger gain or degree must bring, and half of it noise of the process
-_LEAST_VARIANCE = 1e-8  # of the process, of that of the measurements
 
 
 @dataclass(frozen=True)
@@ -74,11 +72,7 @@ def largest_shapes(outputs: int, inputs: int, rows: int, delay: int = 1) -> list
     most = min(MOST_PARAMETERS, rows * outputs // ROWS_A_PARAMETER)
     shapes = []
     for lags in range(1, 4):
-        degrees = [
-            degree
-            for degree in range(1, LARGEST_DEGREE + 1)
-            if Shape(outputs, inputs, lags, degree, delay).parameters <= most
-        ]
+        degrees = [degree for degree in (1, 2, 3) if Shape(outputs, inputs, lags, degree, delay).parameters <= most]
         if degrees:
             shapes.append(Shape(outputs, inputs, lags, degrees[-1], delay))
     return shapes
@@ -128,7 +122,7 @@ def fit_black_box(
         default=None,
     )
     if best is not None:
-        finer = replace(best[2].shape, degree=LARGEST_DEGREE + 1)
+        finer = replace(best[2].shape, degree=4)  # with little noise a cubic is visibly wrong
         other = fit(finer) if finer.parameters <= MOST_PARAMETERS else None
         if other is not None and other[0] - other[1] > best[0] - best[1] + MARGIN:
             best = other
@@ -264,13 +258,14 @@ def _variances(errors: Array, smallest: Array) -> Array:
 def _fit_variances(shape: Shape, rows: Rows, fitted: _Fit) -> tuple[Array, Array, float]:
     """Variances of measurements and process that maximise the likelihood, and that, by a compass search."""
     products, count = shape.products(), shape.outputs
-    bounds = np.log(np.concatenate([rows.smallest, _LEAST_VARIANCE * fitted.variances]))
+    least = 1e-8 * fitted.variances  # of the process: as good as none
+    bounds = np.log(np.concatenate([rows.smallest, least]))
 
     def likelihood(logs: Array) -> float:
         r, q = np.exp(logs[:count]), np.exp(logs[count:])
         return log_likelihood(fitted.theta, products, shape.states, rows.arrays, r, q)
 
-    without = np.maximum(np.log(np.concatenate([fitted.variances, _LEAST_VARIANCE * fitted.variances])), bounds)
+    without = np.maximum(np.log(np.concatenate([fitted.variances, least])), bounds)
     share = max(fitted.gain, 0.03)
     logs = np.log(np.concatenate([fitted.variances * max(1.0 - share, 0.05), fitted.variances * share**2]))
     logs = np.maximum(logs, bounds)

@@ -63,8 +63,7 @@ LARGEST_VALUE = 1e30  # regressors and outputs at or beyond this are refused: al
 # The numbers of an estimator of n parameters: n each of theta, z (the rotated outputs), d (the diagonal), q (the
 # columns' sums of squares) and what z rounds away; then SQUARES to ROWS; then R's n(n-1)/2 entries above the diagonal,
 # by rows, and what they round away.
-SQUARES, WEIGHT, WEIGHT2, TURN, ROWS = range(5)
-SUMS = 5
+SQUARES, WEIGHT, WEIGHT2, TURN, ROWS, SUMS = range(6)
 
 
 @jit

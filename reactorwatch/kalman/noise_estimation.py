@@ -41,8 +41,6 @@ INITIAL_SHARES = (0.3, 0.03, 0.003)
 
 CLIP = 4.0  # standard deviations beyond which the loss of a value is constant
 FIRST_ROWS = 300  # that the first steps of the search use
-LONGEST_STEP = 1.2  # of a logarithm: sizes change by at most a factor of 3.3
-DIFFERENCE = 0.01  # of a logarithm, for derivatives
 _CUT_MEAN_SQUARE = erf(CLIP / sqrt(2)) - CLIP * sqrt(2 / pi) * exp(-(CLIP**2) / 2)  # of w where |w| < CLIP, else 0
 
 
@@ -234,9 +232,11 @@ class _NoiseSearch:
 
         Also returns the predicted gain, -inf for a shortened step, which predicts nothing about what is beyond.
         """
-        near = self._evaluate([best.theta + DIFFERENCE * (np.arange(best.theta.size) == index) for index in chosen])
-        of_w = np.stack([(trial.w - best.w) / DIFFERENCE for trial in near])
-        of_d = np.stack([(trial.d - best.d) / DIFFERENCE for trial in near])
+        largest = 1.2  # of a logarithm: sizes change by at most a factor of 3.3
+        small = 0.01  # of a logarithm, for derivatives
+        near = self._evaluate([best.theta + small * (np.arange(best.theta.size) == index) for index in chosen])
+        of_w = np.stack([(trial.w - best.w) / small for trial in near])
+        of_d = np.stack([(trial.d - best.d) / small for trial in near])
         counted = np.where(np.abs(best.w) < CLIP, 1.0 / _CUT_MEAN_SQUARE, 0.0)
         gradient = np.sum(of_d + of_w * best.w * counted, axis=(1, 2))
         of_w, of_d = (of_w * np.sqrt(counted)).reshape(len(chosen), -1), of_d.reshape(len(chosen), -1)
@@ -246,8 +246,8 @@ class _NoiseSearch:
         step = np.zeros(best.theta.size)
         step[chosen] = -np.linalg.solve(information + np.diag(1e-3 * np.diag(information) + 1.0), gradient)
         longest = float(np.max(np.abs(step)))
-        full = longest <= LONGEST_STEP
-        step *= min(1.0, LONGEST_STEP / max(longest, LONGEST_STEP))
+        full = longest <= largest
+        step *= min(1.0, largest / max(longest, largest))
         for _ in range(4):
             predicted = -float(step[chosen] @ (gradient + 0.5 * information @ step[chosen]))
             if predicted < 0.02:

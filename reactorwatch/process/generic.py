@@ -40,11 +40,8 @@ from reactorwatch.process.signal_effects import (
 )
 from reactorwatch.units import absolute
 
-TIMES_MIN = (0.05, 0.3, 2.0, 10.0)
-"""Lags and delays from which fits start."""
-
-LONGEST_MIN = 1000.0
-"""Largest lag and delay."""
+TIMES: dict[str, Any] = {"upper": 1000.0, "start_values": (0.05, 0.3, 2.0, 10.0)}
+"""Lags and delays in minutes: the largest, and those from which fits start, a factor of six apart."""
 
 TYPICAL_SHARE = 0.02
 """Deviation of a parameter, as a share of its value, that is worth finding."""
@@ -187,7 +184,7 @@ def _of_output(model: ProcessModel, output: Output, scale: float) -> list[Effect
     name, unit = output.name, output.unit
     at: dict[str, Any] = {"output": name, "location": name}
     reach, in_unit = LARGEST_SCALES * scale, "" if unit == "1" else f" {unit}"
-    times: dict[str, Any] = {**at, "scale": scale, "upper": LONGEST_MIN, "start_values": TIMES_MIN}
+    times: dict[str, Any] = {**at, "scale": scale, **TIMES}
     usual = model.function()(*reference_point(model), model.values(), 0.0, 0.0)[1]
     middle = float(usual[model.output_names.index(name)])
     stuck_at = EffectConstant("value", middle, reach, unit, middle - 1e3 * reach, middle + 1e3 * reach, "stuck reading")
@@ -211,7 +208,7 @@ def _of_input(item: Variable) -> list[Effect]:
     name, unit = item.name, item.unit
     at: dict[str, Any] = {"input": name, "location": name}
     in_unit = "" if unit == "1" else f" {unit}"
-    times: dict[str, Any] = {**at, "upper": LONGEST_MIN, "start_values": TIMES_MIN}
+    times: dict[str, Any] = {**at, **TIMES}
     share = f"{{}} % more {name} than commanded", f"{{}} % less {name} than commanded"
     higher = f"{name} higher by {{}}{in_unit} than commanded", f"{name} lower by {{}}{in_unit} than commanded"
     follows = f"{name} follows its command with a time constant of {{}} min"

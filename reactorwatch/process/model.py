@@ -26,7 +26,7 @@ import numpy as np
 from reactorwatch.arrays import Array
 
 MODEL_CACHE_SIZE = 64
-"""Number of models whose functions are cached."""
+"""Number of models whose functions are cached: a diagnosis fits some sixty."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -249,11 +249,6 @@ SHARED, SORTED, RESTARTING, ALTERNATING, REGULAR = "shared", "sorted", "restarti
 """Arrangements of rows: several have one time; they are sorted by tag, on a clock, or with minutes that start again as
 those of batches do; tags alternate, or so do the labels of rows at regular times."""
 
-MIN_DISTINCT = 0.9
-"""Smallest share of steps from a value of a tag to its next at which the time goes on."""
-MIN_CHANGES = 0.1
-"""Smallest share of rows with another tag than the row before, if each tag has times of its own."""
-
 
 class LongFormat(NamedTuple):
     """Columns of a long table, by number: the time, the parts of the tag, the value and its qualities."""
@@ -390,22 +385,24 @@ def _variance_share(table: TextTable, column: int, tags: NDArray[np.intp]) -> fl
 
 def _arrange(times: NDArray[Any], tags: NDArray[np.intp]) -> str:
     """Arrangement of rows that may be of several tags; empty: they are rows of a wide table."""
+    rare = 0.1  # share of rows with another tag than the row before, below which each tag has times of its own
+    distinct = 0.9  # least share of the steps from a value of a tag to its next at which the time goes on
     changed, steps = np.diff(tags) != 0, np.diff(times)
     changes = float(np.mean(changed)) if changed.size else 0.0
     # Half of the rows at most have a tag of their own.
-    if not 1 <= tags.max(initial=0) < 0.5 * tags.size or (changes < MIN_CHANGES and (steps > 0).all()):
+    if not 1 <= tags.max(initial=0) < 0.5 * tags.size or (changes < rare and (steps > 0).all()):
         return ""  # most wide tables, without sorting
     order = np.argsort(tags, kind="stable")
     inner = np.diff(times[order])[np.diff(tags[order]) == 0]
-    if max(np.mean(inner > 0), np.mean(inner < 0)) < MIN_DISTINCT:
+    if max(np.mean(inner > 0), np.mean(inner < 0)) < distinct:
         return ""
     steps = steps if np.median(inner) > 0 else -steps  # the newest may be first
     if np.mean(steps == 0) >= 1 / 6:  # it is 1/2 for two tags that are sampled together
         return SHARED
     if (steps < 0).any() and changed[steps < 0].all():
         return SORTED if times.dtype.kind == "i" else RESTARTING
-    is_regular = np.mean(np.isclose(steps, np.median(steps), rtol=0.1)) > MIN_DISTINCT and changes < MIN_DISTINCT
-    return "" if changes < MIN_CHANGES else REGULAR if is_regular else ALTERNATING
+    is_regular = np.mean(np.isclose(steps, np.median(steps), rtol=0.1)) > distinct and changes < distinct
+    return "" if changes < rare else REGULAR if is_regular else ALTERNATING
 
 
 class TagSeries(NamedTuple):

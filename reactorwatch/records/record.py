@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from reactorwatch.errors import InputError
 
 MINUTE_NS = 60_000_000_000
+"""Nanoseconds in a minute: times on the bus and in files are in nanoseconds, those of models in minutes."""
 
 NEVER_NS = 2**63 - 1
 """A time that does not come; the negative one is before all others."""

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from reactorwatch.errors import InputError
 from reactorwatch.records.cells import NUMBER, TIME
-from reactorwatch.records.file_format import SECONDS, FileFormat
+from reactorwatch.records.file_format import CLOCK_COLUMN, SECONDS, FileFormat
 from reactorwatch.records.record import LONGEST_MIN, MINUTE_NS, to_time_ns
 from reactorwatch.records.table import Layout, TextTable, bare_name
 from reactorwatch.records.timestamps import (
@@ -24,7 +24,6 @@ from reactorwatch.records.timestamps import (
     stated_pattern,
     to_utc,
 )
-from reactorwatch.records.write import CLOCK_COLUMN
 
 STANDARD = {"time_min": "min", "time_s": "s"}
 """Names of time columns that need no guess, and their units."""

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 from reactorwatch.errors import InputError
 from reactorwatch.records.decode import PARQUET_SUFFIXES, list_files, quote_formula
+from reactorwatch.records.file_format import CLOCK_COLUMN, RUN_COLUMN, TIME_COLUMN
 
 if TYPE_CHECKING:
     from reactorwatch.records.record import Record  # it imports NumPy, and help is to be fast
@@ -313,11 +314,7 @@ def fill_folder(folder: Path) -> Iterator[Path]:
         shutil.rmtree(temporary)
 
 
-TIME_COLUMN, RUN_COLUMN, CLOCK_COLUMN = "time_min", "run", "time"
-"""Columns beside the signals: minutes, the run of each row if there are several, and clock time if it is asked for."""
-
 WRITTEN_SUFFIXES = (".csv", ".gz", ".xlsx", ".parquet")
-MAX_SHEET_ROWS = 1_048_576  # of Excel since 2007
 
 
 def write_table(path: Path, record: "Record", *, clock: bool = False) -> None:
@@ -388,10 +385,8 @@ def _write_text(path: Path, record: "Record", clock: bool, *, compress: bool = F
 
 
 def _write_workbook(path: Path, record: "Record", clock: bool) -> None:
-    if record.rows >= MAX_SHEET_ROWS:
-        raise InputError(
-            f"{path}: a sheet has at most {MAX_SHEET_ROWS} rows, got {record.rows}; write .parquet or .csv"
-        )
+    if record.rows >= 1_048_576:  # of Excel since 2007
+        raise InputError(f"{path}: a sheet has at most 1048576 rows, got {record.rows}; write .parquet or .csv")
     try:
         import openpyxl
     except ImportError as error:

@@ -52,6 +52,7 @@ DAYS = 30
 """Days for which false alarms are promised."""
 
 DAYS_MIN = DAYS * 24 * 60.0
+"""The same in minutes."""
 
 USUAL_PER_30_DAYS = 1.0
 """False alarms of a plant that are promised where the settings ask for no number."""

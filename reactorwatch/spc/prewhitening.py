@@ -29,9 +29,6 @@ from reactorwatch.codegen.numba_kernel import Entry, jit
 LARGEST_ORDER = 6
 """Largest number of coefficients: a filter has room for so many past values."""
 
-BLOCK = 50
-"""Rows of a block whose variance is compared with that of others."""
-
 
 class Prewhitening(msgspec.Struct, frozen=True):
     """An autoregression of a residual, learned from its training.
@@ -120,13 +117,14 @@ def _worst_block(error: Array) -> float:
     The fit of a linear model of a nonlinear plant varies with the operating point, and the worst fit makes the false
     alarms. So where blocks of rows differ significantly, sigma is that of the worst of them (the largest of twenty).
     """
-    blocks = error[: error.size // BLOCK * BLOCK].reshape(-1, BLOCK)
+    rows = 50  # of a block: its standard deviation is known to a tenth
+    blocks = error[: error.size // rows * rows].reshape(-1, rows)
     size = np.sqrt(np.mean(error**2)) if error.size else 0.0
     if len(blocks) < 8 or size <= 0.0:
         return 1.0
     sizes = np.sqrt(np.mean(blocks**2, axis=1)) / size
     fourth = float(np.mean(error**4)) / size**4
-    expected_variance = max(fourth - 1.0, 1.0) / (4.0 * BLOCK)
+    expected_variance = max(fourth - 1.0, 1.0) / (4.0 * rows)
     if float(np.var(sizes, ddof=1)) <= 2.0 * expected_variance:
         return 1.0
     return max(float(np.quantile(sizes, 0.95)), 1.0)

@@ -24,14 +24,11 @@ from reactorwatch.contract.codec import message_type
 from reactorwatch.errors import InputError
 from reactorwatch.version import build_metadata, this_build
 from recorder import Channel, RecordedMessage, StoredMessage
-from recorder.files.metadata import METADATA
 from recorder.files.part_file import PART, PartFile, is_locked
 from recorder.files.reader import LATCHED, StoredChannel
+from recorder.files.recording import METADATA
 from recorder.keep import MAX_CHANNELS, channel_of
 from recorder.samples import content_of
-
-MAX_SEQUENCE = 2**32 - 1
-"""Largest sequence number in MCAP; larger ones wrap around to 0."""
 
 
 class WriteError(InputError):
@@ -119,7 +116,7 @@ class RecordingWriter:
         number = self._channels.get(channel)
         if number is None:
             number = self._channels[channel] = self._register(channel)
-        sequence = stored.sequence & MAX_SEQUENCE
+        sequence = stored.sequence & 0xFFFF_FFFF  # 32 bits in MCAP: larger ones wrap around to 0
         self._add_message(number, stored.log_time_ns, stored.payload, stored.publish_time_ns, sequence)
         self._in_chunk += 1
         if self._stream.chunk_end != self._chunk_end:  # the chunk was full

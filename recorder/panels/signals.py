@@ -46,8 +46,6 @@ from recorder.panels.base import (
 
 _ROLES = ("output", "setpoint", "input", "mode", "label")
 """Roles in the order of their plots."""
-BESIDE = SEVERAL[3]
-"""Colour of predictions that are not those of the reference."""
 _ROLE_COLOURS = {"setpoint": SETPOINT, "input": INPUT, "mode": QUIET, "label": QUIET}
 
 
@@ -111,7 +109,7 @@ def _plot(run: RunColumns, name: str, role: str, setpoints: Sequence[str]) -> Ti
         ]
     if (beside := run.estimates_beside.get(name)) is not None:
         label = "arx, for comparison"
-        series.append(Series("predicted beside", beside.time_ns, beside.prediction, BESIDE, width=0.8, legend=label))
+        series.append(Series("predicted beside", beside.time_ns, beside.prediction, RESIDUAL, width=0.8, legend=label))
     if rebuilt is not None:
         series.append(Series("reconstructed", rebuilt.time_ns, rebuilt.value, RESIDUAL, width=1.5))
     unit = run.units.get(name, "")
@@ -126,11 +124,6 @@ def _limits(time_ns: Times, lower: Values, upper: Values) -> tuple[Series, Serie
 
 
 OVERVIEW = Panel("Overview", draw_overview, arranged="beside")
-
-
-MAX_EXCURSION = 25.0
-"""Largest distance of a drawn statistic from the centre, in distances of the limit; beyond it the limits would be
-invisible."""
 
 
 def draw_charts(run: RunColumns) -> tuple[TimePlot, ...]:
@@ -153,8 +146,9 @@ def _residual(name: str, unit: str, estimated: EstimateColumns) -> TimePlot:
 
 
 def _chart(name: str, chart: ChartColumns) -> TimePlot:
-    far = np.maximum(np.abs(chart.upper_limit - chart.centre), np.abs(chart.lower_limit - chart.centre)) * MAX_EXCURSION
-    highest, lowest = chart.centre + far, chart.centre - far
+    distance = np.maximum(np.abs(chart.upper_limit - chart.centre), np.abs(chart.lower_limit - chart.centre))
+    # a statistic 25 distances of the limit away is at the edge of the plot: beyond it the limits would be invisible
+    highest, lowest = chart.centre + 25.0 * distance, chart.centre - 25.0 * distance
     edge = np.where(chart.statistic > highest, highest, np.where(chart.statistic < lowest, lowest, np.nan))
     series = [
         *_limits(chart.time_ns, chart.lower_limit, chart.upper_limit),

@@ -7,9 +7,10 @@ from operator import attrgetter
 import numpy as np
 
 from reactorwatch.contract import messages_pb2 as messages
-from reactorwatch.contract.alarm_text import suspects_text
-from reactorwatch.contract.promise_text import describe_sizes, promise_fields
 from reactorwatch.records.record import to_minutes
+from reactorwatch.results.promise import state_promise
+from reactorwatch.sentences.alarm import suspects_text
+from reactorwatch.sentences.promise import describe_sizes
 from recorder.columns import LISTED, RunColumns, times_of
 from recorder.panels.base import (
     ALARM,
@@ -109,7 +110,7 @@ def _promise_events(run: RunColumns) -> list[Event]:
     before: tuple[object, ...] = ()
     for item in run.promises:
         holds = item.kept and not item.drifted
-        power = [describe_sizes(each) for each in promise_fields(item)["power"]]
+        power = [describe_sizes(each) for each in state_promise(item)[1]]
         stated = (item.found, holds, power)
         if stated == before:
             continue

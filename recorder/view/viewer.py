@@ -34,9 +34,6 @@ SCREENS = ("WAYLAND_DISPLAY", "WAYLAND_SOCKET", "DISPLAY")  # those that winit r
 CLEAN_EXIT_CODES = (None, 0, 130, -signal.SIGINT, -signal.SIGTERM)
 """Codes of a viewer that runs, was closed, or was terminated together with this process."""
 LOOPBACK = ("127.0.0.1", "::1")
-START_TIMEOUT_S = 30.0
-POLL_S = 0.1
-EXIT_TIMEOUT_S = 5.0
 
 
 def viewer_program() -> Path:
@@ -73,7 +70,7 @@ def viewer(
         finally:
             process.terminate()
             try:
-                process.wait(EXIT_TIMEOUT_S)
+                process.wait(5.0)
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.wait()
@@ -198,7 +195,7 @@ def _wait_for(process: subprocess.Popen[bytes], port: int, bind: str, target: Di
     Raises:
         InputError: it has exited, or does not listen in time.
     """
-    deadline = time.monotonic() + START_TIMEOUT_S
+    deadline = time.monotonic() + 30.0
     while time.monotonic() < deadline:
         try:
             with socket.create_connection((_reachable_address(bind), port), timeout=1.0):
@@ -206,11 +203,11 @@ def _wait_for(process: subprocess.Popen[bytes], port: int, bind: str, target: Di
         except OSError:
             pass
         try:
-            code = process.wait(POLL_S)
+            code = process.wait(0.1)
         except subprocess.TimeoutExpired:
             continue
         raise _exit_error(code, target, log)
-    raise InputError(f"the viewer does not listen at {bind}:{port} after {START_TIMEOUT_S:g} s")
+    raise InputError(f"the viewer does not listen at {bind}:{port} after 30 s")
 
 
 def _exit_error(code: int, target: DisplayTarget, log: Path) -> InputError:

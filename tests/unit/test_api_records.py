@@ -8,7 +8,7 @@ import pyarrow as pa
 import pytest
 
 import reactorwatch as rw
-from reactorwatch.description.find import ProcessChoice
+from reactorwatch.description.read import ProcessChoice
 from reactorwatch.records.record import Record as MeasuredRecord
 from reactorwatch.records.write import write_table
 from recorder.tools.convert import import_csv
@@ -68,7 +68,7 @@ def test_a_record_is_taken_with_its_process_by_all_functions(from_arrays: rw.Rec
     assert found.fit.free_run > 75.0
     result = rw.backtest(from_arrays)
     assert result.reference in ("black-box", "arx")
-    assert (result.signals["inputs"], result.signals["outputs"]) == (["u"], ["y"])
+    assert (result.signals.inputs, result.signals.outputs) == (["u"], ["y"])
     assert result.trained_until_min == pytest.approx(100 * 2 / 60)
     for function in (rw.simulate, rw.diagnose):
         with pytest.raises(rw.InputError, match="process 'rig': must have equations for this, got none"):

@@ -92,10 +92,10 @@ def sources(tmp_path_factory: pytest.TempPathFactory) -> Path:
         folder,
         f"{checks}/jump.py",
         example("Add a signal check"),
-        f"{checks}/stage.py",
+        f"{checks}/signal_checks.py",
         "JumpCheck",
         "JumpCheck",
-        ")",
+        ", RangeCheck)",
     )
     effect = example("Add an effect").partition("\n\n\nfrom ")[0] + "\n"
     add(

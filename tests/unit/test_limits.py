@@ -17,8 +17,8 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
 from reactorwatch.cli.main import LIMITS_FILE, main
-from reactorwatch.description.find import find_process, read_extended_model
 from reactorwatch.description.process import Process, Signal
+from reactorwatch.description.read import find_process, read_extended_model
 from reactorwatch.errors import InputError
 from reactorwatch.limits import Limits, limits, parse_json, parse_toml, set_limits
 from reactorwatch.process.extended_model import parse_extended_model

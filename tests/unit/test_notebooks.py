@@ -61,13 +61,13 @@ def test_a_result_is_a_figure_with_a_panel_for_each_signal(results: dict[str, An
 
 @pytest.mark.parametrize("name", RESULTS)
 def test_a_result_is_a_page_that_stands_alone(results: dict[str, Any], name: str, tmp_path: Path) -> None:
-    pytest.importorskip("matplotlib")
     results[name].to_html(tmp_path / "page.html")
     page = (tmp_path / "page.html").read_text(encoding="utf-8")
     assert page.startswith("<!doctype html>")
     assert "leak <1>" not in page
     assert f"reactorwatch {rw.__version__}" in page
     assert 'src="http' not in page
+    assert page.count("<svg viewBox") >= PANELS[name]
 
 
 def test_a_backtest_marks_its_training_and_its_alarms_in_its_figure(results: dict[str, Any]) -> None:

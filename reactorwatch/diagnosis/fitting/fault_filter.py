@@ -12,9 +12,14 @@ from numpy.typing import NDArray
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.compiled_function import LANES
 from reactorwatch.codegen.numba_kernel import jit
-from reactorwatch.diagnosis.fitting.augmented_model import AugmentedModel, augment_model
+from reactorwatch.diagnosis.fitting.augmented_model import (
+    AugmentedModel,
+    ShiftedRun,
+    augment_model,
+    restore_rows,
+    shift_measurements,
+)
 from reactorwatch.diagnosis.fitting.colored_noise import Noise, add_colored_noise, estimate_noise
-from reactorwatch.diagnosis.fitting.measurement_delay import ShiftedRun, restore_rows, shift_measurements
 from reactorwatch.diagnosis.fitting.profiles import Signal
 from reactorwatch.diagnosis.run import Run, input_uncertainty_of
 from reactorwatch.kalman.batch import (
@@ -77,7 +82,7 @@ class FaultFilter:
     """EKF of a model in which the magnitudes of some effects are inputs.
 
     A measurement delay is not part of the filter's model: the delayed values are shifted in time (see
-    `measurement_delay`).
+    `augmented_model`).
 
     Args:
         model: process model of the plant.
@@ -177,7 +182,7 @@ class FaultFilter:
         return self._augmented.interval_inputs[index], self._augmented.sample_inputs[index]
 
     def shifts_time(self, index: int) -> bool:
-        """Return true if the effect at this index shifts the timing, see `input_timing`."""
+        """Return true if the effect at this index shifts the timing, see `augmented_model`."""
         late = self.delay_index
         return index != late and self._augmented.shifts_time[index - (late is not None and late < index)]
 

@@ -9,13 +9,12 @@ from numpy.typing import NDArray
 
 from reactorwatch.arrays import Array
 from reactorwatch.diagnosis.fitting import signatures
-from reactorwatch.diagnosis.fitting.bounded_least_squares import inverse
 from reactorwatch.diagnosis.fitting.fault_filter import FaultFilter
 from reactorwatch.diagnosis.fitting.hypothesis import Fit, Hypothesis
 from reactorwatch.diagnosis.fitting.profiles import Constant
+from reactorwatch.diagnosis.fitting.signatures import inverse
 from reactorwatch.diagnosis.law.fit import ShapeFit
-from reactorwatch.diagnosis.law.path import variables_along
-from reactorwatch.diagnosis.law.shapes import coefficient_effect
+from reactorwatch.diagnosis.law.shapes import coefficient_effect, variables_along
 from reactorwatch.diagnosis.law.unknown import FittedLaw, Unknown
 from reactorwatch.diagnosis.parameter_priors import add_priors
 from reactorwatch.diagnosis.result import LISTED, Estimate, HeldOut, Law, LawCurve, RivalLaw

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from reactorwatch.arrays import Array
 from reactorwatch.diagnosis.fitting import signatures
-from reactorwatch.diagnosis.fitting.bounded_least_squares import solve_bounded
 from reactorwatch.diagnosis.fitting.profiles import Constant, FittedProfile, PiecewiseLinear, Sine
+from reactorwatch.diagnosis.fitting.signatures import solve_bounded
 from reactorwatch.diagnosis.run import Run
 from reactorwatch.diagnosis.search.screen import KNOTS, Part, Screen, all_finite, first_of_each
 from reactorwatch.kalman.error_dynamics import ErrorDynamics

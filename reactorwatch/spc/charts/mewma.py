@@ -63,7 +63,7 @@ from reactorwatch.spc.run_length import (
 from reactorwatch.stored_state import Memory
 
 SMALLEST_WEIGHT_WITHOUT_SHIFT = 1e-4
-"""Smallest weights whose run length is computed: without a shift there is one dimension, with far fewer nodes."""
+"""Smallest weight whose run length is computed: without a shift there is one dimension, with far fewer nodes."""
 
 LARGEST_LIMIT = 200.0
 """Largest limit whose run length after a shift is computed: the nodes of its two dimensions grow with it."""

@@ -17,7 +17,6 @@ from monitor_node.replay.backtest import run as watch
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from plant_node.scenario import HeldRecord
-from reactorwatch.api.backtest_report import backtest_object, backtest_text
 from reactorwatch.api.simulation import report, simulate_along
 from reactorwatch.cli import identify
 from reactorwatch.cli.batch import as_table, expand_files
@@ -28,7 +27,8 @@ from reactorwatch.identification.identify import ModelForm
 from reactorwatch.process.library.cstr import cstr
 from reactorwatch.records.record import Record, join_runs
 from reactorwatch.records.write import check_folder_name
-from recorder.files.metadata import FILE_INDEX
+from reactorwatch.sentences.backtest import backtest_text
+from recorder.files.recording import FILE_INDEX
 from recorder.files.writer import RecordingWriter
 from recorder.tools.convert import import_csv
 from recorder.tools.player import samples_of
@@ -148,10 +148,9 @@ def test_a_back_test_raises_the_same_alarms_after_the_clock_was_set_back(whole: 
     ]
     assert raised[: len(raised) // 2] == raised[len(raised) // 2 :]
     assert len(raised) >= 4
-    said = backtest_object(back, 0)
-    assert (said["samples"], said["runs"], said["zero"]) == (ROWS, 2, None)
-    assert said["span_min"] == pytest.approx(159.8)
-    assert "2 runs" in backtest_text(back, 0, Path("run.csv"))
+    assert (back.samples, back.runs, back.zero) == (ROWS, 2, None)
+    assert back.span_min == pytest.approx(159.8)
+    assert "2 runs" in backtest_text(back)
 
 
 def test_several_runs_drive_no_plant(whole: Record) -> None:

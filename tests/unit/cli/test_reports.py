@@ -1,21 +1,22 @@
-"""`backtest` prints the reference in use and its noise levels."""
+"""A back-test in words: the reference in use, its noise levels, and a headline for each incident."""
 
-import dataclasses
 import re
-from pathlib import Path
 from typing import Literal
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from monitor_node.config import MonitorConfig
-from monitor_node.replay.backtest import RAISED, Backtest, run
-from reactorwatch.api.alarm_lines import MOST_INCIDENTS, Raised, alarm_lines, headline
-from reactorwatch.api.backtest_report import backtest_headline, backtest_object, backtest_text
+from monitor_node.replay.backtest import run
 from reactorwatch.contract.messages_pb2 import PRIORITY_CRITICAL, PRIORITY_HIGH, Alarm, Suspect
 from reactorwatch.records.record import to_time_ns
+from reactorwatch.results.alarms import RaisedAlarm
+from reactorwatch.results.backtest import Backtest
+from reactorwatch.sentences.backtest import backtest_headline, backtest_text
+from reactorwatch.sentences.incidents import MOST_INCIDENTS, alarm_lines, headline
 from tests.unit.monitor_node.samples import leaking_run, samples
 
 
@@ -29,37 +30,31 @@ def test_the_equations_are_named_with_the_noise_of_the_sensors_and_states(
     reference: Literal["auto", "process"],
 ) -> None:
     result = judged(reference)
-    found = backtest_object(result, 0)
-    assert found["reference"] == "equations"
-    assert found["noise_levels"]["sensors"] == {"C": pytest.approx(0.002, rel=0.2), "T": pytest.approx(0.3, rel=0.2)}
-    assert set(found["noise_levels"]["states"]) == {"C", "T"}
-    assert "reference: the equations; standard deviation of the sensors' noise: C 0.00" in backtest_text(
-        result, 0, Path("run.csv")
-    )
+    assert result.reference == "equations"
+    assert result.noise_levels is not None
+    assert result.noise_levels.sensors == {"C": pytest.approx(0.002, rel=0.2), "T": pytest.approx(0.3, rel=0.2)}
+    assert set(result.noise_levels.states) == {"C", "T"}
+    assert "reference: the equations; standard deviation of the sensors' noise: C 0.00" in backtest_text(result)
 
 
-def test_identified_models_are_named_and_have_no_noise_levels() -> None:
-    result = judged("arx")
-    found = backtest_object(result, 0)
-    assert (found["reference"], found["noise_levels"]) == ("arx", None)
-    assert "reference: identified models (ARX)" in backtest_text(result, 0, Path("run.csv"))
-
-
-def test_a_record_that_was_not_judged_names_nothing() -> None:
-    result = judged("auto", 20.0)
-    found = backtest_object(result, 0)
-    assert (found["reference"], found["noise_levels"]) == (None, None)
-    assert "reference: " not in backtest_text(result, 0, Path("run.csv"))
+@pytest.mark.parametrize(
+    ("span_min", "reference", "stated"), [(115.0, "arx", ["reference: identified models (ARX)"]), (20.0, None, [])]
+)
+def test_identified_models_and_a_record_that_was_not_judged_have_no_noise_levels(
+    span_min: float, reference: str | None, stated: list[str]
+) -> None:
+    result = judged("arx", span_min)
+    assert (result.reference, result.noise_levels) == (reference, None)
+    assert [line for line in backtest_text(result).splitlines() if line.startswith("reference: ")] == stated
 
 
 def test_a_note_on_the_promise_is_left_out_where_the_promise_is_stated() -> None:
-    result = judged("arx")
     note = "promise: it does not hold"
-    with_note = dataclasses.replace(result, notes=[note, "another"])
+    result = replace(judged("arx"), notes=[note, "another"])
     assert result.promise is not None
-    assert "another" in backtest_text(with_note, 0, Path("run.csv"))
-    assert note not in backtest_text(with_note, 0, Path("run.csv"))
-    assert note in backtest_text(dataclasses.replace(with_note, promise=None), 0, Path("run.csv"))
+    assert "another" in backtest_text(result)
+    assert note not in backtest_text(result)
+    assert note in backtest_text(replace(result, promise=None))
 
 
 def raised(
@@ -71,7 +66,8 @@ def raised(
     *,
     priority: int = PRIORITY_HIGH,
     text: str = "",
-) -> Raised:
+) -> RaisedAlarm:
+    """An alarm; one of silence names its cause itself."""
     suspects = [] if suspect is None else [suspect]
     message = Alarm(
         alarm=alarm,
@@ -80,8 +76,9 @@ def raised(
         incident=incident,
         suspects=suspects,
         text=text,
+        names_cause=alarm.startswith(("silence/", "stuck/", "range/")),
     )
-    return message, None if cleared_min is None else to_time_ns(cleared_min)
+    return RaisedAlarm.of(message, None if cleared_min is None else to_time_ns(cleared_min), 0)
 
 
 LEAK = Suspect(
@@ -157,11 +154,15 @@ def test_whatever_is_raised_there_is_one_line_an_incident_and_none_states_the_al
 ) -> None:
     drawn.sort(key=lambda item: item[1])
     alarms = [
-        raised(name, 100.0 * incident + row, None if length is None else 100.0 * incident + row + length, incident)
-        for row, (name, incident, _, length) in enumerate(drawn)
+        raised(
+            name,
+            100.0 * incident + row,
+            None if length is None else 100.0 * incident + row + length,
+            incident,
+            priority=priority,
+        )
+        for row, (name, incident, priority, length) in enumerate(drawn)
     ]
-    for (alarm, _), (_, _, priority, _) in zip(alarms, drawn, strict=True):
-        alarm.priority = priority  # type: ignore[assignment]
     lines, incidents = headline(alarms, 0), {item[1] for item in drawn}
     events, shown = lines[:MOST_INCIDENTS], []
     assert len(lines) == min(len(incidents), MOST_INCIDENTS) + (len(incidents) > MOST_INCIDENTS)
@@ -175,19 +176,14 @@ def test_whatever_is_raised_there_is_one_line_an_incident_and_none_states_the_al
 def test_the_promise_that_a_training_cannot_keep_is_reported_before_the_alarms_and_they_are_no_detections() -> None:
     result = judged("arx")
     assert result.promise is not None
-    weak = type(result.promise)()
-    weak.CopyFrom(result.promise)
-    weak.kept, weak.can_keep_per_30_days = False, 1080.0
-    alarms = [raised("ewma/T", 150.3, 160.0, 1)[0], raised("mewma/all", 900.0, None, 2, LEAK)[0]]
-    for alarm in alarms:
-        alarm.event = RAISED
-    for messages, count in (
+    weak = replace(result, promise=replace(result.promise, kept=False), can_keep_per_30_days=1080.0)
+    alarms = [raised("ewma/T", 150.3, 160.0, 1), raised("mewma/all", 900.0, None, 2, LEAK)]
+    for shown, count in (
         (alarms, "2 alarms were raised in 2 incidents"),
         (alarms[:1], "1 alarm was raised in 1"),
         ([], "no alarms were raised"),
     ):
-        shown = dataclasses.replace(result, promise=weak, alarm_messages=messages)
-        lines = backtest_text(shown, 0, Path("run.csv")).splitlines()
+        lines = backtest_text(replace(weak, alarms=shown)).splitlines()
         assert lines[1].startswith(
             "not trustworthy yet: by its training, false alarms may come 1 in 40 min; train longer"
         )
@@ -201,7 +197,7 @@ def test_a_leak_after_a_step_of_the_clock_is_stated_since_its_own_onset() -> Non
     time_min, columns = leaking_run(-0.15, 150.0, 200.0, seed=1)
     stepped = np.where(time_min > 130.0, time_min + 45.0, time_min)
     result = run(samples(stepped, columns), MonitorConfig())
-    (line,) = backtest_headline(result, 0)
+    (line,) = backtest_headline(result)
     found = re.match(r"Detected since ([0-9.]+) min: 15 % of the coolant lost \([0-9]+ %\)", line)
     assert found is not None, line
     assert float(found[1]) == pytest.approx(195.0, abs=1.0)

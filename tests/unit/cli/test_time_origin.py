@@ -18,7 +18,7 @@ from reactorwatch.cli.batch import make_jobs
 from reactorwatch.cli.diagnose import write_extended_model
 from reactorwatch.cli.options import parse_span_ns
 from reactorwatch.cli.recordings import cut
-from reactorwatch.description.find import ProcessChoice
+from reactorwatch.description.read import ProcessChoice
 from reactorwatch.diagnosis.diagnose import diagnose
 from reactorwatch.process.library.cstr import cstr
 from reactorwatch.records.record import Record

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 from monitor_node.config import MonitorConfig
-from monitor_node.replay.backtest import Backtest, run
+from monitor_node.replay.backtest import run
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from reactorwatch.api.files import open_messages
@@ -20,14 +20,15 @@ from reactorwatch.cli.backtest import choose_settings
 from reactorwatch.cli.batch import Job
 from reactorwatch.cli.diagnose import write_extended_model
 from reactorwatch.cli.main import app
-from reactorwatch.description.find import DEFAULT_CHOICE, ProcessChoice
-from reactorwatch.diagnosis.units import find_wrong_unit
+from reactorwatch.description.read import DEFAULT_CHOICE, ProcessChoice
+from reactorwatch.diagnosis.record_checks import find_wrong_unit
 from reactorwatch.errors import InputError
 from reactorwatch.identification.identify import ModelForm
 from reactorwatch.process import MODELS
 from reactorwatch.process.library.cstr import cstr
 from reactorwatch.records.record import Record
 from reactorwatch.records.write import write_table
+from reactorwatch.results.backtest import Backtest
 from reactorwatch.spc.charts.base import format_quantity
 from recorder.columns import find_model, read_run, signal_title
 from recorder.files.recording import Recording

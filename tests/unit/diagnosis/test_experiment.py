@@ -7,9 +7,15 @@ import pytest
 
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
-from reactorwatch.diagnosis.experiment.constraints import check_limits, limits_of
 from reactorwatch.diagnosis.experiment.design import FEWEST, PATTERN_ROWS, propose_experiment
-from reactorwatch.diagnosis.experiment.input_sequence import HOLDS_ROWS, QUIET_ROWS, InputRange, initial_sequences
+from reactorwatch.diagnosis.experiment.inputs import (
+    HOLDS_ROWS,
+    QUIET_ROWS,
+    InputRange,
+    check_limits,
+    initial_sequences,
+    limits_of,
+)
 from reactorwatch.diagnosis.experiment.predictions import Predictions
 from reactorwatch.diagnosis.fitting.colored_noise import Noise
 from reactorwatch.diagnosis.fitting.fault_filter import FaultFilter

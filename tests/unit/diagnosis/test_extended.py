@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from reactorwatch.diagnosis.extended import extended_model
+from reactorwatch.diagnosis.estimates import extended_model
 from reactorwatch.diagnosis.fitting.profiles import Decay, FittedProfile, PiecewiseLinear, Ramp, Sine, Step
 from reactorwatch.diagnosis.result import Cause, Estimate
 from reactorwatch.process.extended_model import parse_extended_model

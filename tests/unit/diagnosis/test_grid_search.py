@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from reactorwatch.diagnosis.fitting import grid_search
 from reactorwatch.diagnosis.fitting.colored_noise import Noise
 from reactorwatch.diagnosis.fitting.fault_filter import FaultFilter
 from reactorwatch.diagnosis.fitting.hypothesis import Hypothesis
 from reactorwatch.diagnosis.fitting.profiles import Constant, Step
+from reactorwatch.diagnosis.fitting.refinement import fit_hypothesis, search_coarse, search_fine
 from reactorwatch.process.library.cstr import EFFECTS, cstr
 
 from .runs import make_run
@@ -21,8 +21,8 @@ def test_an_onset_that_no_slope_leads_to_is_found(size: float, onset_min: float)
     run = make_run(f"valve_stiction:step:{size}@{onset_min}min", rows=3000)
     hypothesis = Hypothesis(FaultFilter(cstr(), (STICKS,), NOISE), (Step(run.time_min),))
     truth = hypothesis.evaluate(run, (np.array([size, onset_min]),))
-    search_coarse = grid_search.search_coarse(run, hypothesis, hypothesis.evaluate(run, (np.array([6.3, 40.0]),)))
-    found = grid_search.search_fine(run, hypothesis, search_coarse)
+    coarse = search_coarse(run, hypothesis, hypothesis.evaluate(run, (np.array([6.3, 40.0]),)))
+    found = search_fine(run, hypothesis, coarse)
     assert found.loss <= truth.loss + 1e-6
     # When it began to stick shows only in where it stands from the next move on that it does not follow.
     after = slice(int(10.0 * onset_min) + 100, None)
@@ -33,7 +33,7 @@ def test_a_size_is_found_between_the_two_moves_that_it_lies_between() -> None:
     run = make_run("valve_stiction:constant:4.0", rows=1500)
     hypothesis = Hypothesis(FaultFilter(cstr(), (STICKS,), NOISE), (Constant(run.time_min),))
     truth = hypothesis.evaluate(run, (np.array([4.0]),))
-    found = grid_search.fit_hypothesis(run, hypothesis, (np.array([1.5]),))
+    found = fit_hypothesis(run, hypothesis, (np.array([1.5]),))
     assert found.loss <= truth.loss + 1e-6
     assert found.parameters[0][0] == pytest.approx(4.0, abs=0.5)
 

@@ -10,8 +10,7 @@ from scipy.signal import lfilter
 
 from reactorwatch.arrays import Array
 from reactorwatch.diagnosis.diagnose import diagnose
-from reactorwatch.diagnosis.fitting.colored_noise import ColoredNoise, Noise
-from reactorwatch.diagnosis.high_frequency_noise import estimate_sensor_noise
+from reactorwatch.diagnosis.fitting.colored_noise import ColoredNoise, Noise, estimate_sensor_noise
 from reactorwatch.diagnosis.result import UNKNOWN
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.library.cstr import EFFECTS, cstr

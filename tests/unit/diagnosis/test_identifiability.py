@@ -10,9 +10,8 @@ from typer.testing import CliRunner
 from reactorwatch.cli.main import app
 from reactorwatch.diagnosis.diagnose import diagnose
 from reactorwatch.diagnosis.identifiability import Identifiability, identifiability
-from reactorwatch.diagnosis.record_checks import make_run
+from reactorwatch.diagnosis.record_checks import ROWS, excite, make_run
 from reactorwatch.diagnosis.result import NOMINAL
-from reactorwatch.diagnosis.usual_excitation import ROWS, excite
 from reactorwatch.process import effects_of
 from reactorwatch.process.library.cascaded_tanks import EFFECTS as TANK_EFFECTS
 from reactorwatch.process.library.cascaded_tanks import tanks

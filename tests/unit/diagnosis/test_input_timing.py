@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from reactorwatch.arrays import Array
+from reactorwatch.diagnosis.fitting.augmented_model import effective_timing
 from reactorwatch.diagnosis.fitting.colored_noise import Noise
 from reactorwatch.diagnosis.fitting.fault_filter import FaultFilter
 from reactorwatch.diagnosis.fitting.hypothesis import MOST_STEPS, Hypothesis
-from reactorwatch.diagnosis.fitting.input_timing import effective_timing
-from reactorwatch.diagnosis.fitting.onset_refinement import refine_onset
 from reactorwatch.diagnosis.fitting.profiles import Decay, FittedProfile, Ramp, Step
+from reactorwatch.diagnosis.fitting.refinement import refine_onset
 from reactorwatch.process.library.cstr import EFFECTS, cstr
 from tests.unit.diagnosis.runs import make_run
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from reactorwatch.diagnosis.fitting.hypothesis import Hypothesis
-from reactorwatch.diagnosis.fitting.knot_selection import GRID, select_knots
 from reactorwatch.diagnosis.fitting.profiles import PiecewiseLinear
+from reactorwatch.diagnosis.fitting.refinement import GRID, select_knots
 from reactorwatch.diagnosis.search.search import FittedHypothesis, Search
 from reactorwatch.process.library.cstr import EFFECTS, cstr
 from tests.unit.diagnosis.runs import make_run

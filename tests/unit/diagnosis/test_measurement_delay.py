@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from reactorwatch.diagnosis.fitting.augmented_model import shift_measurements
 from reactorwatch.diagnosis.fitting.colored_noise import Noise
 from reactorwatch.diagnosis.fitting.fault_filter import FaultFilter
-from reactorwatch.diagnosis.fitting.measurement_delay import shift_measurements
 from reactorwatch.diagnosis.fitting.profiles import Constant
 from reactorwatch.diagnosis.run import Run
 from reactorwatch.process.library.cstr import EFFECTS, cstr

@@ -6,10 +6,10 @@ from scipy.optimize import lsq_linear
 
 from reactorwatch.arrays import Array
 from reactorwatch.diagnosis.diagnose import diagnose
-from reactorwatch.diagnosis.fitting.bounded_least_squares import solve_bounded
 from reactorwatch.diagnosis.fitting.colored_noise import Noise
 from reactorwatch.diagnosis.fitting.fault_filter import FaultFilter
 from reactorwatch.diagnosis.fitting.hypothesis import Hypothesis
+from reactorwatch.diagnosis.fitting.signatures import solve_bounded
 from reactorwatch.diagnosis.result import NAMED
 from reactorwatch.diagnosis.search.pair_screen import PairScreen
 from reactorwatch.diagnosis.search.screen import Screen

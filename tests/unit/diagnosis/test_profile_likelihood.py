@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from reactorwatch.diagnosis.estimates import WITHIN_ROW, refine
 from reactorwatch.diagnosis.fitting.hypothesis import Hypothesis
 from reactorwatch.diagnosis.fitting.profiles import Step
-from reactorwatch.diagnosis.profile_likelihood import WITHIN_ROW, refine
 from reactorwatch.diagnosis.record_checks import make_run as of_record
 from reactorwatch.diagnosis.result import Estimate
 from reactorwatch.diagnosis.search.search import Search

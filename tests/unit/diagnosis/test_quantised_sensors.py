@@ -7,9 +7,8 @@ import pytest
 
 from reactorwatch.diagnosis.diagnose import diagnose
 from reactorwatch.diagnosis.identifiability import identifiability
-from reactorwatch.diagnosis.record_checks import make_run
+from reactorwatch.diagnosis.record_checks import excite, make_run
 from reactorwatch.diagnosis.search.search import Search, smallest_noise
-from reactorwatch.diagnosis.usual_excitation import excite
 from reactorwatch.process.generic import generic_effects
 from reactorwatch.process.library.cascaded_tanks import tanks
 from reactorwatch.process.library.three_tanks import three_tanks

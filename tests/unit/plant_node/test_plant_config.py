@@ -9,7 +9,7 @@ import msgspec
 import pytest
 
 from plant_node.config import PlantConfig, ProcessSettings, fit_settings
-from reactorwatch.description.find import DEFAULT_PROCESS, find_process
+from reactorwatch.description.read import DEFAULT_PROCESS, find_process
 from reactorwatch.errors import InputError
 from reactorwatch.process.library.cstr import EFFECTS
 from reactorwatch.process.library.cstr_operation import LevelControl, TemperatureControl

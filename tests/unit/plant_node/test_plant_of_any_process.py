@@ -13,8 +13,8 @@ from plant_node.record import plant_from, simulate_record
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, encode_message
 from reactorwatch.contract.messages_pb2 import InjectFault, SetInput
-from reactorwatch.description.find import find_process
 from reactorwatch.description.process import Process, Signal
+from reactorwatch.description.read import find_process
 from reactorwatch.errors import InputError
 from reactorwatch.process import MODELS
 from reactorwatch.process.operation import Controller

@@ -10,7 +10,7 @@ from typer.main import get_command
 from plant_node.config import PlantConfig, fit_settings
 from plant_node.record import simulate_record
 from reactorwatch.cli.main import app
-from reactorwatch.description.find import find_process
+from reactorwatch.description.read import find_process
 from reactorwatch.errors import InputError
 from reactorwatch.process.fault import parse_fault
 from reactorwatch.process.library.cstr import cstr

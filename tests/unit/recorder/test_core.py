@@ -1,16 +1,17 @@
-"""Messages as the recorder stores them."""
+"""Messages as the recorder stores them, and its own alarms."""
 
 import os
 from pathlib import Path
 
 import pytest
+from google.protobuf.message import Message
 
 from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
-from reactorwatch.contract.codec import Body, Encoded, Publication, encode, encode_message, encoding_of
+from reactorwatch.contract.codec import Body, Encoded, Publication, encode, encode_message
+from reactorwatch.contract.messages_pb2 import Alarm, AlarmCommand, CommandReply, ListAlarms
 from reactorwatch.runtime.reorder_buffer import Gap
-from recorder import RecordedMessage
-from recorder.core import DISK_ALARM, KEYS_ALARM, Recorder, fingerprint
+from recorder.core import DISK_ALARM, KEYS_ALARM, PRIORITIES, OwnAlarms, Recorder, fingerprint
 
 KEY = "reactor/cstr/sample/T"
 GOOD = messages.QUALITY_GOOD
@@ -26,57 +27,12 @@ def health(recorder: Recorder, now_ns: int = 1000) -> messages.Health:
     return message
 
 
-def test_an_entry_has_the_time_of_receipt_and_that_of_its_sample() -> None:
-    message = encoded(messages.Sample(time_ns=77, value=1.0, quality=GOOD), received_ns=500)
-    kept = Recorder("cstr", 0).on_message(message, 600)
-    assert kept is not None
-    assert kept.channel.is_readable
-    assert kept.recorded_message == RecordedMessage(KEY, message.payload, encoding_of(messages.Sample), 500, 77)
-
-
-def test_without_a_time_of_receipt_it_is_the_moment_of_the_work() -> None:
-    kept = Recorder("cstr", 0).on_message(encoded(messages.Sample(time_ns=77, quality=GOOD)), 600)
-    assert kept is not None
-    assert kept.recorded_message.log_time_ns == 600
-
-
 def test_the_time_of_receipt_never_runs_backwards() -> None:
     recorder = Recorder("cstr", 100)
     received = [
-        recorder.on_message(encoded(messages.Sample(quality=GOOD), received_ns=at), at) for at in (300, 200, 400)
+        recorder.on_message(encoded(messages.Sample(quality=GOOD), received_ns=at), 500) for at in (300, 200, 400)
     ]
     assert [kept.recorded_message.log_time_ns for kept in received if kept] == [300, 300, 400]
-
-
-def test_what_cannot_be_read_is_kept_as_it_is_and_counted_by_reason() -> None:
-    recorder = Recorder("cstr", 0)
-    strange = [
-        Encoded("reactor/cstr/sample/T", b"{}", "application/json"),
-        Encoded("reactor/cstr/sample/T", b"\xff\xff", encoding_of(messages.Sample)),
-        Encoded("reactor/cstr", *encode_message(messages.Sample(quality=GOOD))),
-        Encoded("reactor/cstr/sample/T", *encode_message(messages.Sample(time_ns=-1, quality=GOOD))),
-        Encoded("reactor/cstr/sample/T", b"", encoding_of(messages.Sample)),
-    ]
-    kept = [recorder.on_message(message, 50) for message in strange]
-    assert [item is not None and item.channel.is_readable for item in kept] == [False, False, True, True, True]
-    for message, item in zip(strange, kept, strict=True):
-        assert item is not None
-        assert item.recorded_message[:3] == message[:3]
-    assert [item.recorded_message.publish_time_ns for item in kept if item] == [50, 50, 0, 50, 0]
-    report = health(recorder)
-    assert dict(report.refused_by_reason) == {"encoding": 1, "payload": 2, "key": 1, "time": 1}
-    assert (report.refused, report.received) == (5, 5)
-
-
-def test_the_counts_of_keys_that_are_followed_no_longer_stay(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("recorder.core.MAX_COUNTERS", 3)
-    recorder = Recorder("cstr", 0)
-    for number in range(10):
-        for sequence in (0, 2, 2):
-            sample = messages.Sample(sequence=sequence, time_ns=sequence, quality=GOOD)
-            recorder.on_message(encoded(sample, f"reactor/p{number}/sample/T"), 0)
-    report = health(recorder)
-    assert (report.lost, report.duplicated) == (10, 10)
 
 
 def test_health_reports_losses_by_key() -> None:
@@ -244,9 +200,9 @@ def test_a_recorder_that_stops_raises_one_alarm_until_it_resumes_and_counts_what
     assert last.phase == "stopped"
 
 
-def test_out_of_order_samples_of_evicted_keys_stay_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_counts_of_evicted_keys_stay(monkeypatch: pytest.MonkeyPatch) -> None:
     """The least recently used key is the one that is evicted."""
-    monkeypatch.setattr("recorder.core.MAX_COUNTERS", 2)
+    monkeypatch.setattr("recorder.core.MAX_KEYS", 2)
     recorder = Recorder("cstr", 0)
 
     def receive(plant: str, *sequences: int) -> None:
@@ -255,30 +211,20 @@ def test_out_of_order_samples_of_evicted_keys_stay_counted(monkeypatch: pytest.M
             recorder.on_message(encoded(sample, f"reactor/{plant}/sample/T"), 0)
 
     receive("a", 0, 2, 1)
-    receive("b", 0, 2, 1)
+    receive("b", 0, 2, 1, 1)
     receive("a", 3)
     receive("c", 0)
-    assert health(recorder).out_of_order == 2
+    assert (health(recorder).out_of_order, health(recorder).duplicated) == (2, 1)
     receive("a", 5)
     assert health(recorder).lost == 1, "a is still followed"
     receive("b", 9)
     assert health(recorder).lost == 1, "b starts again"
 
 
-@pytest.mark.parametrize("unreadable", [True, False])
-def test_the_channel_of_a_message_is_of_the_product_if_key_and_payload_are(*, unreadable: bool) -> None:
-    for key, is_ours in ((KEY, True), ("plant/T", False)):
-        message = encoded(messages.Sample(quality=GOOD), key)
-        kept = Recorder("cstr", 0).on_message(message._replace(payload=b"\xff") if unreadable else message, 0)
-        assert kept is not None
-        channel = kept.channel
-        assert (channel.key, channel.encoding) == (key, message.encoding)
-        assert (channel.is_product, channel.is_readable) == (is_ours and not unreadable, not unreadable)
-
-
 @pytest.mark.parametrize(
     ("message", "publish_time_ns", "sequence", "refused"),
     [
+        (encoded(messages.Sample(time_ns=77, sequence=1, quality=GOOD)), 77, 1, {}),
         (encoded(messages.Estimate(time_ns=5), "reactor/cstr/estimate/T"), 5, 0, {}),
         (encoded(messages.Estimate(time_ns=-5), "reactor/cstr/estimate/T"), 9, 0, {"time": 1}),
         (encoded(messages.Sample(time_ns=5, sequence=3, quality=GOOD), "plant/T"), 5, 3, {"key": 1}),
@@ -289,13 +235,15 @@ def test_the_channel_of_a_message_is_of_the_product_if_key_and_payload_are(*, un
         (Encoded(KEY, b"{}", "application/json"), 9, 0, {"encoding": 1}),
     ],
 )
-def test_a_message_has_its_own_time_and_number_where_they_can_be_read(
+def test_any_message_is_kept_with_its_own_time_and_number_where_they_can_be_read_and_refusals_are_counted(
     message: Encoded, publish_time_ns: int, sequence: int, refused: dict[str, int]
 ) -> None:
     recorder = Recorder("cstr", 0)
     kept = recorder.on_message(message, 9)
     assert kept is not None
     assert (kept.log_time_ns, kept.publish_time_ns, kept.sequence) == (9, publish_time_ns, sequence)
+    assert kept.recorded_message[:3] == message[:3]
+    assert kept.channel.is_readable == (message.payload not in (b"\xff", b"{}"))
     assert health(recorder).refused_by_reason == refused
 
 
@@ -307,3 +255,85 @@ def test_a_sample_that_is_too_large_is_recorded_as_one_that_cannot_be_read(monke
         kept = Recorder("cstr", 0).on_message(message, 9)
         assert kept is not None
         assert (kept.sequence, kept.channel.is_readable) == (sequence, sequence == 3)
+
+
+NORMAL, RAISED = messages.ALARM_STATE_NORMAL, messages.ALARM_STATE_UNACKNOWLEDGED
+SEEN, GONE = messages.ALARM_STATE_ACKNOWLEDGED, messages.ALARM_STATE_RETURNED_UNACKNOWLEDGED
+EACH = pytest.mark.parametrize("name", list(PRIORITIES))
+
+
+def by_ada(name: str) -> AlarmCommand:
+    return AlarmCommand(alarm=name, by="Ada", comment="I make room")
+
+
+def ask(alarms: OwnAlarms, command: str, message: Message) -> tuple[CommandReply, list[Publication]]:
+    return alarms.execute(Encoded(keys.key("cstr", keys.COMMAND, command), *encode_message(message)), 7)
+
+
+def now(alarms: OwnAlarms, name: str) -> Alarm:
+    listed = ask(alarms, keys.LIST_RECORDER_ALARMS, ListAlarms())[0].alarms
+    return next(alarm for alarm in listed if alarm.alarm == name)
+
+
+@EACH
+def test_each_goes_through_the_states_that_any_alarm_does_and_the_others_stay_as_they_are(name: str) -> None:
+    """ISA-18.2: raised, acknowledged, cleared; and raised, cleared, acknowledged."""
+    alarms = OwnAlarms("cstr")
+    others = [alarm for alarm in PRIORITIES if alarm != name]
+    assert now(alarms, name).state == NORMAL
+    alarms.raise_alarm(name, "no space left", 1)
+    assert (now(alarms, name).state, now(alarms, name).raised_ns, now(alarms, name).cleared_ns) == (RAISED, 1, 0)
+    assert now(alarms, name).priority == PRIORITIES[name]
+    ask(alarms, keys.ACKNOWLEDGE_RECORDER, by_ada(name))
+    assert now(alarms, name).state == SEEN
+    assert alarms.is_active(name)
+    alarms.clear(name, "there is room", 2)
+    assert (now(alarms, name).state, now(alarms, name).cleared_ns) == (NORMAL, 2)
+    alarms.raise_alarm(name, "no space left", 3)
+    assert (now(alarms, name).state, now(alarms, name).by) == (RAISED, "")
+    alarms.clear(name, "there is room", 4)
+    assert now(alarms, name).state == GONE
+    ask(alarms, keys.ACKNOWLEDGE_RECORDER, by_ada(name))
+    assert now(alarms, name).state == NORMAL
+    assert {now(alarms, other).state for other in others} == {NORMAL}
+
+
+@EACH
+def test_an_acknowledgement_is_published_with_the_person_and_the_comment(name: str) -> None:
+    alarms = OwnAlarms("cstr")
+    alarms.raise_alarm(name, "no space left", 1)
+    reply, (published,) = ask(alarms, keys.ACKNOWLEDGE_RECORDER, by_ada(name))
+    assert reply.accepted
+    assert published.key == f"reactor/cstr/alarm/{name}"
+    message = published.message
+    assert isinstance(message, Alarm)
+    assert reply.alarms[0] == message == now(alarms, name)
+    assert (message.event, message.by, message.comment, message.time_ns) == ("acknowledge", "Ada", "I make room", 7)
+
+
+@pytest.mark.parametrize(
+    ("command", "message", "text"),
+    [
+        (keys.ACKNOWLEDGE_RECORDER, AlarmCommand(alarm=DISK_ALARM), "by must name the person"),
+        (keys.ACKNOWLEDGE_RECORDER, AlarmCommand(alarm="ewma/T", by="Ada"), "no alarm 'ewma/T' of the recorder"),
+        (keys.ACKNOWLEDGE_RECORDER, AlarmCommand(alarm=DISK_ALARM, by="A", comment="x" * 1001), "at most 1000"),
+        (keys.ACKNOWLEDGE_RECORDER, ListAlarms(), "command acknowledge_recorder must carry"),
+        ("shelve", by_ada(DISK_ALARM), "unknown command 'shelve' (valid: list_recorder_alarms, acknowledge_recorder)"),
+    ],
+)
+def test_what_cannot_be_done_is_refused_with_the_reason(command: str, message: Message, text: str) -> None:
+    alarms = OwnAlarms("cstr")
+    alarms.raise_alarm(DISK_ALARM, "no space left", 1)
+    reply, published = ask(alarms, command, message)
+    assert (reply.accepted, published) == (False, [])
+    assert text in reply.text
+    assert now(alarms, DISK_ALARM).state == RAISED
+
+
+@EACH
+def test_each_is_acknowledged_once_and_not_before_it_is_raised(name: str) -> None:
+    alarms = OwnAlarms("cstr")
+    assert "is normal, there is nothing to acknowledge" in ask(alarms, keys.ACKNOWLEDGE_RECORDER, by_ada(name))[0].text
+    alarms.raise_alarm(name, "no space left", 1)
+    assert ask(alarms, keys.ACKNOWLEDGE_RECORDER, by_ada(name))[0].accepted
+    assert "is acknowledged already" in ask(alarms, keys.ACKNOWLEDGE_RECORDER, by_ada(name))[0].text

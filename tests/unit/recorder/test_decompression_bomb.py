@@ -10,20 +10,10 @@ from pathlib import Path
 import lz4.frame
 import pytest
 import zstandard
-from mcap.data_stream import RecordBuilder
-from mcap.records import (
-    Channel,
-    Chunk,
-    ChunkIndex,
-    DataEnd,
-    Footer,
-    Header,
-    McapRecord,
-    Metadata,
-    MetadataIndex,
-    Statistics,
-)
+from mcap.records import Chunk, DataEnd, Footer, Header, Metadata, MetadataIndex, Statistics
 from mcap.writer import MCAP0_MAGIC
+
+from tests.unit.recorder.mcap_bytes import DESCRIBED, bytes_of, index_of
 
 MEBIBYTE = 1 << 20
 BOMB_BYTES = 1 << 30
@@ -64,13 +54,6 @@ COMMANDS = (
 )
 
 
-def bytes_of(*records: McapRecord) -> bytes:
-    builder = RecordBuilder()
-    for record in records:
-        record.write(builder)
-    return bytes(builder.end())  # type: ignore[no-untyped-call]
-
-
 def zstd_bomb() -> bytes:
     packed = zstandard.ZstdCompressor().compressobj(size=BOMB_BYTES)
     return b"".join(packed.compress(bytes(MEBIBYTE)) for _ in range(BOMB_BYTES // MEBIBYTE)) + packed.flush()
@@ -83,7 +66,6 @@ def lz4_bomb() -> bytes:
         return b"".join((start, *parts, packed.flush()))
 
 
-CHANNEL = bytes_of(Channel(id=1, topic="reactor/cstr/sample/T", message_encoding="x", metadata={}, schema_id=0))
 COUNTS = Statistics(
     attachment_count=0,
     channel_count=1,
@@ -106,31 +88,15 @@ def finished(content: bytes, summary: bytes) -> bytes:
     return content + summary + bytes_of(Footer(start, 0, crc)) + MCAP0_MAGIC
 
 
-def index_of(chunk: Chunk, record: bytes, at: int) -> bytes:
-    return bytes_of(
-        ChunkIndex(
-            chunk_length=len(record),
-            chunk_start_offset=at,
-            compression=chunk.compression,
-            compressed_size=len(chunk.data),
-            message_end_time=2,
-            message_index_length=0,
-            message_index_offsets={1: at},
-            message_start_time=1,
-            uncompressed_size=chunk.uncompressed_size,
-        )
-    )
-
-
 FILES: dict[str, Callable[[Chunk, bytes], bytes]] = {
-    "indexed": lambda chunk, record: finished(HEAD + record, CHANNEL + index_of(chunk, record, len(HEAD))),
+    "indexed": lambda chunk, record: finished(HEAD + record, DESCRIBED + bytes_of(index_of(chunk, record, len(HEAD)))),
     "without an index": lambda _, record: finished(HEAD + record, b""),
-    "without an index of the chunk": lambda _, record: finished(HEAD + record, CHANNEL + bytes_of(COUNTS)),
-    "chunk within the index": lambda _, record: finished(HEAD, CHANNEL + record),
+    "without an index of the chunk": lambda _, record: finished(HEAD + record, DESCRIBED + bytes_of(COUNTS)),
+    "chunk within the index": lambda _, record: finished(HEAD, DESCRIBED + record),
     "chunk in place of metadata": lambda chunk, record: finished(
         HEAD + record,
-        CHANNEL
-        + index_of(chunk, record, len(HEAD))
+        DESCRIBED
+        + bytes_of(index_of(chunk, record, len(HEAD)))
         + bytes_of(MetadataIndex(offset=len(HEAD), length=len(record), name="reactorwatch")),
     ),
     "after metadata": lambda _, record: finished(

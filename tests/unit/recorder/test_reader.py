@@ -8,7 +8,7 @@ from mcap.records import Channel, Chunk, Metadata
 from reactorwatch.errors import InputError
 from recorder.files.index import LATEST_NS
 from recorder.files.reader import Damage, Reader, read_start
-from tests.unit.recorder.test_chunk_data import DESCRIBED, KEY, bytes_of, chunk, message, recording
+from tests.unit.recorder.mcap_bytes import DESCRIBED, KEY, bytes_of, chunk, message, recording
 
 FIRST = chunk(DESCRIBED + message(1) + message(4), first_ns=1, last_ns=4)
 SECOND = chunk(message(5) + message(9), first_ns=5, last_ns=9)
@@ -108,13 +108,6 @@ def test_a_damaged_chunk_is_named_by_its_byte_and_the_others_are_read(path: Path
     assert damage.endswith(f") at byte {HEADER_END}")
     with pytest.raises(InputError, match=f"the chunk at byte {HEADER_END} cannot be read"):
         list(Reader(path))
-
-
-def test_where_a_length_is_damaged_the_next_chunk_is_found(path: Path) -> None:
-    content = WHOLE[: HEADER_END + 1] + b"\xff" * 8 + WHOLE[HEADER_END + 9 :]
-    assert read(path, content) == ([5, 9], [f"{FIRST_END - HEADER_END} bytes at byte {HEADER_END}"])
-    with pytest.raises(InputError, match=f"at byte {HEADER_END}"):
-        read(path, content, tolerant=False)
 
 
 @pytest.mark.parametrize("lost", [1, 20, 37])

@@ -1,10 +1,18 @@
-"""A full disk at any byte: no message reported as saved is lost, none is there twice, and flushing resumes."""
+"""The file being written: a full disk at any byte loses no message that is reported as saved, and none is there twice.
 
+A full disk at any byte: no message reported as saved is lost, none is there twice, and flushing resumes.
+
+Drained bytes are in the file, synced ones on the disk, and the lock lasts as long as the recorder.
+"""
+
+import contextlib
 import errno
+import fcntl
 import os
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from mcap.reader import make_reader
@@ -15,33 +23,15 @@ from reactorwatch.contract.messages_pb2 import QUALITY_GOOD, Sample
 from reactorwatch.errors import InputError
 from recorder import RecordedMessage
 from recorder.files.copies import recover
-from recorder.files.part_file import PartFile
+from recorder.files.part_file import PART, PartFile, is_locked, lock_orphan, open_recording
 from recorder.files.reader import Reader, StoredChannel, metadata_records
 from recorder.files.recording import Recording
 from recorder.files.writer import RecordingWriter, WriteError, check_free
 from tests.unit.recorder import golden
+from tests.unit.recorder.recording import Disk
 
 ENTRIES = list(golden.entries())[:30]
 FIRST, SECOND = ENTRIES[:15], ENTRIES[15:]
-
-
-class Disk:
-    """Disk with a room in bytes; a write may be taken in part."""
-
-    room = 10**9
-
-    def open(self, path: Path) -> PartFile:
-        disk = self
-
-        class OnDisk(PartFile):
-            def _append(self, data: bytearray) -> int:
-                if not disk.room:
-                    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-                taken = super()._append(data[: disk.room])
-                disk.room -= taken
-                return taken
-
-        return OnDisk(path)
 
 
 def start_second_chunk(folder: Path) -> tuple[Disk, RecordingWriter, Path]:
@@ -158,8 +148,7 @@ def test_the_library_reads_a_recording_and_its_statistics_agree(tmp_path: Path) 
 
 
 def test_a_recording_that_cannot_be_started_leaves_no_file(tmp_path: Path) -> None:
-    disk, path = Disk(), tmp_path / "run.mcap"
-    disk.room = 20
+    disk, path = Disk(20), tmp_path / "run.mcap"
     with pytest.raises(WriteError) as raised:
         RecordingWriter(path, {}, disk.open)
     assert str(raised.value) == f"recording {path}: cannot be written: No space left on device"
@@ -276,3 +265,120 @@ def test_messages_before_an_attachment_are_in_the_file_ahead_of_it(tmp_path: Pat
     reader = Reader(tmp_path / "run.mcap")
     assert len(list(reader)) == 1
     assert [item.name for item in reader.attachments()] == ["a"]
+
+
+DATA = b"x" * 1000
+
+
+def open_part(folder: Path) -> PartFile:
+    """A new file in a folder."""
+    return PartFile(folder / f"run.mcap{PART}")
+
+
+@contextlib.contextmanager
+def abandoned(file: PartFile) -> Iterator[PartFile]:
+    """A file that is abandoned at the end."""
+    try:
+        yield file
+    finally:
+        file.abandon()
+
+
+@pytest.mark.parametrize(
+    "act", [PartFile.sync, lambda file: file.finish(file.path.with_suffix(""))], ids=["sync", "finish"]
+)
+def test_the_system_is_asked_to_write_all_bytes_to_the_disk(
+    act: Callable[[PartFile], None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    synced = list[tuple[int, bool, int]]()
+    path = tmp_path / f"run.mcap{PART}"
+    file = PartFile(path)
+    number = path.stat().st_ino
+
+    def record(descriptor: int) -> None:
+        status = os.fstat(descriptor)
+        synced.append((status.st_ino, path.exists(), status.st_size))
+
+    monkeypatch.setattr(os, "fsync", record)
+    file.write(DATA)
+    act(file)
+    file.abandon()
+    assert synced == [(number, True, len(DATA))]
+
+
+def test_bytes_are_buffered_until_they_are_drained_and_dropped_when_the_file_is_abandoned(tmp_path: Path) -> None:
+    path = tmp_path / f"run.mcap{PART}"
+    file = PartFile(path)
+    assert file.write(b"abc") == 3
+    file.flush()
+    assert (file.tell(), file.drained, path.stat().st_size) == (3, 0, 0)
+    file.drain()
+    assert (file.tell(), file.drained, path.read_bytes()) == (3, 3, b"abc")
+    file.write(b"de")
+    assert (file.tell(), file.closed) == (5, False)
+    file.abandon()
+    assert (file.tell(), file.closed, path.read_bytes()) == (3, True, b"abc")
+    file.abandon()
+
+
+def test_a_finished_file_has_its_complete_name_and_no_lock(tmp_path: Path) -> None:
+    file, complete = open_part(tmp_path), tmp_path / "run.mcap"
+    file.write(DATA)
+    assert is_locked(file.path)
+    file.finish(complete)
+    assert (file.closed, file.path.exists(), complete.read_bytes()) == (True, False, DATA)
+    assert not is_locked(complete)
+    assert not is_locked(file.path), "it does not exist"
+
+
+def test_a_file_that_cannot_be_renamed_is_closed_under_its_old_name(tmp_path: Path) -> None:
+    file = open_part(tmp_path)
+    file.write(DATA)
+    with pytest.raises(FileNotFoundError):
+        file.finish(tmp_path / "none" / "run.mcap")
+    assert (file.closed, file.path.read_bytes(), is_locked(file.path)) == (True, DATA, False)
+
+
+def test_an_orphan_is_locked_by_one_process_at_a_time_and_by_none_while_it_is_written(tmp_path: Path) -> None:
+    file = open_part(tmp_path)
+    with pytest.raises(InputError, match="is still being written; stop its recorder first"), lock_orphan(file.path):
+        pass
+    file.write(DATA)
+    file.drain()
+    file.abandon()
+    with lock_orphan(file.path) as stream:
+        assert stream.read() == DATA
+        assert is_locked(file.path)
+    assert not is_locked(file.path)
+
+
+def test_an_orphan_that_another_file_replaced_while_it_was_locked_is_left_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / f"run.mcap{PART}"
+    path.write_bytes(DATA)
+    lock = fcntl.flock
+
+    def replace(*arguments: Any) -> None:
+        lock(*arguments)
+        path.unlink()
+        path.write_bytes(b"")
+
+    monkeypatch.setattr(fcntl, "flock", replace)
+    with pytest.raises(FileNotFoundError, match="is another file by now"), lock_orphan(path):
+        pass
+    assert not is_locked(path)
+
+
+def test_a_file_that_its_recorder_completed_meanwhile_is_opened_under_its_complete_name(tmp_path: Path) -> None:
+    complete, part = tmp_path / "run.mcap", tmp_path / f"run.mcap{PART}"
+    complete.write_bytes(DATA)
+    for path in (complete, part):
+        with open_recording(path) as stream:
+            assert stream.read() == DATA
+    part.write_bytes(b"part")
+    with open_recording(part) as stream:
+        assert stream.read() == b"part"
+    for missing in (tmp_path / "none.mcap", tmp_path / f"none.mcap{PART}"):
+        with pytest.raises(FileNotFoundError):
+            open_recording(missing)

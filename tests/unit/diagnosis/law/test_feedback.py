@@ -7,8 +7,7 @@ from reactorwatch.diagnosis.diagnose import diagnose
 from reactorwatch.diagnosis.fitting.colored_noise import Noise
 from reactorwatch.diagnosis.fitting.fault_filter import FaultFilter
 from reactorwatch.diagnosis.fitting.hypothesis import Hypothesis
-from reactorwatch.diagnosis.law.feedback import find_answers
-from reactorwatch.diagnosis.law.shapes import make_shape
+from reactorwatch.diagnosis.law.shapes import find_answers, make_shape
 from reactorwatch.diagnosis.law.unknown import start_places
 from reactorwatch.diagnosis.record_checks import make_run
 from reactorwatch.process.law import find_place

@@ -131,7 +131,7 @@ def test_a_stated_resolution_shows_a_stuck_sensor_behind_rounding_and_a_constant
         result = backtest.run(plant.messages(), plant.config(resolution=resolution))
         raised = [alarm.alarm for alarm, _ in result.raised_alarms]
         assert ("stuck/y0" in raised) is is_seen
-        assert ("y1" in result.left_out) is not is_seen
+        assert ("y1" in result.exclusions) is not is_seen
         assert ("shewhart/y1" in raised) is is_seen
 
 

@@ -126,12 +126,12 @@ def test_a_back_test_has_the_promise_for_the_rows_it_judged() -> None:
     time_min, columns = sound_run(80.0, seed=3)
     found = rw.backtest(Record(time_min, columns, "sound"), training_min=60.0, isolation=False, diagnose_training=False)
     assert found.promise is not None
-    assert found.promise["expected"] == found.expected_false_alarms
-    assert found.promise["expected"] < found.promise["expected_90"] < 0.01
-    assert {"checked_rows", "found_in_training", "expected_in_training", "kept", "can_keep_per_30_days"} < set(
-        found.promise
-    )
-    assert f"promise: {found.promise['text']}" in str(found)
+    assert found.promise.expected == found.expected_false_alarms
+    assert found.promise.expected < found.promise.expected_90 < 0.01
+    stated = found.to_dict()["promise"]
+    assert {"checked_rows", "found_in_training", "expected_in_training", "kept", "can_keep_per_30_days"} < stated.keys()
+    assert stated["text"] == found.promise["text"]
+    assert f"promise: {found.promise.text}" in str(found)
 
 
 def test_before_rows_are_judged_there_is_no_promise() -> None:
