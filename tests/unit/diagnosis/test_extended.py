@@ -17,7 +17,7 @@ TIMES_MIN = np.arange(0.0, 100.05, 0.1)
 
 def cause_of(name: str, profile: FittedProfile, fitted: list[float]) -> Cause:
     parameters = {key: Estimate(value, 0.0, "1") for key, value in profile.profile_values(np.array(fitted)).items()}
-    return Cause(name, profile.name, name, "coolant", parameters)
+    return Cause(cause=name, profile=profile.name, label=name, location="coolant", parameters=parameters)
 
 
 def deviation(model: ProcessModel, times_min: list[float]) -> list[float]:

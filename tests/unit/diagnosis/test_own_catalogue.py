@@ -7,14 +7,13 @@ import numpy as np
 import pytest
 
 from reactorwatch.diagnosis.diagnose import diagnose
-from reactorwatch.diagnosis.report.machine import as_object
 from reactorwatch.diagnosis.report.page import as_page
-from reactorwatch.diagnosis.report.plain import as_text
 from reactorwatch.diagnosis.result import AMBIGUOUS, NAMED, NOMINAL, UNKNOWN
 from reactorwatch.process import effects_of
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.library.cstr import EFFECTS, cstr
 from reactorwatch.records.record import Record
+from reactorwatch.sentences.diagnosis import diagnosis_text
 from tests.unit.diagnosis.linear_tank import NOISE_SD, PERIOD_MIN, Shift, follows, tank
 from tests.unit.diagnosis.runs import record_of
 
@@ -56,8 +55,8 @@ def test_a_model_of_ones_own_is_diagnosed_with_whatever_catalogue(
     named = effects_of(model) if effects is None else effects
     assert (found.verdict, bool(found.causes)) == (verdict, verdict in (NAMED, AMBIGUOUS))
     assert found.significant == found.practical == (verdict != NOMINAL)
-    assert json.loads(json.dumps(as_object(found, "a.csv", 1.0)))["verdict"] == verdict
-    assert as_text(found, "a.csv", named).startswith("a.csv")
+    assert json.loads(json.dumps(found.to_dict()))["verdict"] == verdict
+    assert diagnosis_text(found, named).startswith(found.file)
     assert as_page(found, model, named, "a.csv", "m.json", "x.csv", on_the_bus=False).startswith("<!doctype html>")
 
 

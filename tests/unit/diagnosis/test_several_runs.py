@@ -9,12 +9,11 @@ import pytest
 from reactorwatch.diagnosis.diagnose import diagnose
 from reactorwatch.diagnosis.holdout import OBSERVED_ROWS, holdout_rows
 from reactorwatch.diagnosis.record_checks import make_run
-from reactorwatch.diagnosis.report.machine import as_object
-from reactorwatch.diagnosis.report.plain import as_text
 from reactorwatch.errors import InputError
 from reactorwatch.process.extended_model import parse_extended_model
 from reactorwatch.process.library.cstr import cstr
 from reactorwatch.records.record import Record, join_runs
+from reactorwatch.sentences.diagnosis import diagnosis_text
 from tests.unit.diagnosis.runs import record_of
 from tests.unit.process.effect_named import effect_of
 
@@ -62,13 +61,13 @@ def test_a_plant_that_was_started_again_is_sound(start_min: float) -> None:
 def test_a_fault_is_found_at_the_minute_that_the_clock_showed(leaking: Record, by_min: float) -> None:
     record = set_back(leaking, by_min)
     found = diagnose(record, cstr(), CATALOGUE)
-    said = as_object(found, "run.csv", 1.0)
-    (cause,) = said["causes"]
-    assert (cause["cause"], cause["run"], said["runs"]) == ("coolant_flow", 2, 2)
-    assert cause["parameters"]["onset"]["value"] == pytest.approx(ONSET_MIN - by_min, abs=0.1)
+    (cause,) = found.causes
+    assert (cause.cause, cause.run, found.runs) == ("coolant_flow", 2, 2)
+    assert cause.to_dict()["run"] == 2
+    assert cause.parameters["onset"].value == pytest.approx(ONSET_MIN - by_min, abs=0.1)
     extended = parse_extended_model(msgspec.json.encode(found.extended_model))
-    assert extended.effects[0].values["onset"] == cause["parameters"]["onset"]["value"]
-    text = as_text(found, "run.csv", CATALOGUE)
+    assert extended.effects[0].values["onset"] == cause.parameters["onset"].value
+    text = diagnosis_text(found, CATALOGUE)
     assert "of run 2" in text
     assert "2 runs" in text
 

@@ -11,12 +11,11 @@ import pytest
 
 from reactorwatch.diagnosis.diagnose import diagnose
 from reactorwatch.diagnosis.report.page import as_page
-from reactorwatch.diagnosis.report.plain import as_text
-from reactorwatch.diagnosis.report.words import describe_verdict
 from reactorwatch.diagnosis.result import NAMED, NOMINAL, Diagnosis
 from reactorwatch.process import effects_of
 from reactorwatch.process.extended_model import parse_extended_model
 from reactorwatch.process.library.cascaded_tanks import tanks
+from reactorwatch.sentences.diagnosis import describe_verdict, diagnosis_text
 from tests.unit.diagnosis.rig import NOISE_V, Rig, record_of
 
 
@@ -55,7 +54,7 @@ def test_another_brim_and_another_share_that_is_caught_are_fitted() -> None:
     assert found.gain.held_out["x2"].rmse_after < 1.15 * NOISE_V
     extended = parse_extended_model(json.dumps(found.extended_model)).build()
     assert extended.parameter("overflow.brim").value == pytest.approx(cause.parameters["brim"].value)
-    assert "brim 7.5" in as_text(found, "tanks.csv", effects_of(tanks()))
+    assert "brim 7.5" in diagnosis_text(found, effects_of(tanks()))
 
 
 @pytest.mark.parametrize(

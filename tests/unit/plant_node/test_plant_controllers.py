@@ -69,7 +69,7 @@ def test_the_plant_under_control_settles_as_fast_as_its_eigenvalues(flow_l_min: 
 
 def test_beyond_the_gain_that_the_eigenvalues_allow_the_plant_swings() -> None:
     critical = brentq(lambda gain: radius(85.0, gain) - 1, 10, 30, xtol=1e-3)
-    assert critical == pytest.approx(18.0, abs=0.1)  # as controllers.py says
+    assert critical == pytest.approx(18.0, abs=0.1)  # l/min/K
     rest = resting(85.0)
     swing = {}
     for share in (0.9, 1.1):

@@ -1,10 +1,10 @@
 """A law is found with parameters that are known but to a standard deviation, and both are estimated together."""
 
 from collections.abc import Mapping
-from dataclasses import replace
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from reactorwatch.diagnosis.diagnose import diagnose
 from reactorwatch.diagnosis.result import UNKNOWN

@@ -1,48 +1,44 @@
-"""A diagnosis in sentences."""
+"""A diagnosis in words: its verdict, causes, law and errors in sentences, and all of it as lines for a terminal."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 from math import floor, isfinite, log10
+from typing import TYPE_CHECKING
 
 import numpy as np
+from msgspec.structs import replace
 
-from reactorwatch.diagnosis.difference import TIME, Difference
-from reactorwatch.diagnosis.result import (
-    AMBIGUOUS,
-    NAMED,
-    NOMINAL,
-    SD_95,
-    AdjustedParameter,
-    Cause,
-    Curves,
-    Diagnosis,
-    Estimate,
-    HeldOut,
-    Law,
-)
 from reactorwatch.process import LOCATION_PHRASES
 from reactorwatch.process.effect import Effect
+from reactorwatch.terminal import printable_lines
+
+if TYPE_CHECKING:
+    from reactorwatch.diagnosis.difference import Difference
+    from reactorwatch.diagnosis.result import AdjustedParameter, Cause, Curves, Diagnosis, Estimate, HeldOut, Law
+
+INDENT = 14
+
+TIME = "time"  # the axis of time in a difference
 
 MOSTLY_NOISE, WORSE = 0.9, 1.2
 """Noise share above which no range is named; error of a range, relative to all rows, above which it is named."""
 
 
-def describe_verdict(diagnosis: Diagnosis) -> str:
+def describe_verdict(diagnosis: "Diagnosis") -> str:
     """Verdict in a sentence or two."""
     off = [name for name, item in diagnosis.parameters.items() if item.differs]
-    if diagnosis.verdict == NOMINAL and off:
+    if diagnosis.verdict == "nominal" and off:
         return (
             f"The simulation is right within what was stated of its parameters: {' and '.join(off)} "
             f"{'is' if len(off) == 1 else 'are'} a little off, and the rest of the record is noise."
         )
-    if diagnosis.verdict == NOMINAL:
+    if diagnosis.verdict == "nominal":
         return "The simulation is right: the rest of the record is noise."
     matters = describe_significance(diagnosis)
-    if diagnosis.verdict == AMBIGUOUS:
+    if diagnosis.verdict == "ambiguous":
         explanations = [diagnosis.causes, *(item.explanation for item in diagnosis.alternatives)]
         names = [" with ".join(f"{item.label} ({describe_timing(item)})" for item in causes) for causes in explanations]
         return f"The simulation is wrong, and the record cannot tell why: {' or '.join(names)}. {matters}"
-    if diagnosis.verdict == NAMED:
+    if diagnosis.verdict == "named":
         causes = [f"{cause.label}, {describe_timing(cause, diagnosis.curves)}" for cause in diagnosis.causes]
         return f"The simulation is wrong: {'; and '.join(causes)}. {matters}"
     text = f"The simulation is wrong, and no known cause explains it; it acts {describe_location(diagnosis)}."
@@ -51,13 +47,15 @@ def describe_verdict(diagnosis: Diagnosis) -> str:
     return f"{text} {matters}"
 
 
-def law_rows(law: Law) -> list[tuple[str, str]]:
+def law_rows(law: "Law") -> list[tuple[str, str]]:
     """Facts about a law, each with its name."""
     unit = "" if law.unit == "1" else f", in {law.unit}"
     rows = [("law", f"{law.formula}{unit}, {law.term}")]
     rows += [(name, f"{format_interval(item)}  (95 %)") for name, item in law.parameters.items()]
-    for name, (other, value) in law.correlations.items():
-        rows.append((name, f"would have the correlation {value:.2f} with {other}, if that were uncertain"))
+    for name, item in law.correlations.items():
+        rows.append(
+            (name, f"would have the correlation {item.correlation:.2f} with {item.parameter}, if that were uncertain")
+        )
     ranges = ", ".join(f"{name} from {low:.4g} to {high:.4g}" for name, (low, high) in law.range.items())
     rows.append(("range", f"seen with {ranges}; it need not hold outside"))
     rows += [
@@ -67,12 +65,12 @@ def law_rows(law: Law) -> list[tuple[str, str]]:
     return rows
 
 
-def describe_significance(diagnosis: Diagnosis) -> str:
+def describe_significance(diagnosis: "Diagnosis") -> str:
     """Practical significance."""
     return "It matters in practice." if diagnosis.practical else "In practice the difference is too small to matter."
 
 
-def describe_location(diagnosis: Diagnosis) -> str:
+def describe_location(diagnosis: "Diagnosis") -> str:
     """Location of the deviation."""
     if not diagnosis.location:
         return "where this record does not tell"
@@ -88,7 +86,7 @@ def describe_place(location: str) -> str:
     return LOCATION_PHRASES.get(location, f"in the {location.replace('_', ' ')}")
 
 
-def describe_timing(cause: Cause, curves: Curves | None = None) -> str:
+def describe_timing(cause: "Cause", curves: "Curves | None" = None) -> str:
     """Onset of a cause, or its profile in time."""
     if cause.profile == "constant":
         return "all the time"
@@ -98,14 +96,14 @@ def describe_timing(cause: Cause, curves: Curves | None = None) -> str:
         largest = "" if curves is None else f", largest at {_largest_min(cause, curves):.4g} min"
         return f"changing over the record{largest}"
     since = f"since {format_interval(cause.parameters['onset'])}"
-    if cause.run > 1:
+    if (cause.run or 1) > 1:
         since += f" of run {cause.run}"
     if cause.profile == "ramp":
         return f"growing {since}"
     return f"settling {since}" if cause.profile == "decay" else since
 
 
-def describe_size(cause: Cause, effects: Sequence[Effect]) -> str:
+def describe_size(cause: "Cause", effects: Sequence[Effect]) -> str:
     """Size of a cause with its 95 % interval, the part of the profile it belongs to, and constants of the effect.
 
     Args:
@@ -118,7 +116,7 @@ def describe_size(cause: Cause, effects: Sequence[Effect]) -> str:
     return _describe_size(cause, effects) + of_what.get(cause.profile, "") + "".join(constants)
 
 
-def describe_explanation(causes: Sequence[Cause], effects: Sequence[Effect]) -> str:
+def describe_explanation(causes: Sequence["Cause"], effects: Sequence[Effect]) -> str:
     """Causes of an explanation, each with its size and onset."""
     return " with ".join(
         f"{item.label} ({item.cause}, {item.profile}): {describe_size(item, effects)}, {describe_timing(item)}"
@@ -126,7 +124,7 @@ def describe_explanation(causes: Sequence[Cause], effects: Sequence[Effect]) -> 
     )
 
 
-def _describe_size(cause: Cause, effects: Sequence[Effect]) -> str:
+def _describe_size(cause: "Cause", effects: Sequence[Effect]) -> str:
     size = cause.parameters["size"]
     effect = next((item for item in effects if item.name == cause.cause), None)
     if effect is None or not effect.larger:
@@ -159,9 +157,10 @@ def describe_causes(causes: Sequence[tuple[str, str]], effects: Sequence[Effect]
     return " with ".join(labels)
 
 
-def format_interval(estimate: Estimate) -> str:
+def format_interval(estimate: "Estimate") -> str:
     """Estimate and half width of its 95 % interval, with the unit.
 
+    >>> from reactorwatch.diagnosis.result import Estimate
     >>> format_interval(Estimate(-0.0499634, 8.5e-5, "1"))
     '-0.04996 ± 0.00017'
     >>> format_interval(Estimate(299.9, 0.0, "min"))
@@ -172,15 +171,16 @@ def format_interval(estimate: Estimate) -> str:
     return f"{value} ± {half}{unit}" if half else f"{value}{unit}"
 
 
-def round_estimate(estimate: Estimate) -> tuple[str, str]:
+def round_estimate(estimate: "Estimate") -> tuple[str, str]:
     """Estimate and half width of its 95 % interval with equal decimals; the latter empty if it is not known.
 
     The interval has one digit, or two if it begins with a 1.
 
+    >>> from reactorwatch.diagnosis.result import Estimate
     >>> round_estimate(Estimate(14.998, 0.0127, "%"))
     ('15.00', '0.02')
     """
-    half = SD_95 * estimate.sd
+    half = estimate.half_width
     if not (isfinite(half) and half > 0.0):
         return f"{estimate.value:.5g}", ""
     first = floor(log10(half))
@@ -190,10 +190,9 @@ def round_estimate(estimate: Estimate) -> tuple[str, str]:
     return f"{estimate.value:.{decimals}f}", f"{half:.{decimals}f}"
 
 
-def describe_parameter(item: AdjustedParameter) -> str:
+def describe_parameter(item: "AdjustedParameter") -> str:
     """Estimate of an uncertain parameter, with its prior."""
-    stated = Estimate(item.nominal, item.stated_sd, item.estimate.unit)
-    return f"{format_interval(item.estimate)}; stated: {format_interval(stated)}"
+    return f"{format_interval(item.estimate)}; stated: {format_interval(item.prior)}"
 
 
 def format_error(value: float, unit: str) -> str:
@@ -201,13 +200,13 @@ def format_error(value: float, unit: str) -> str:
     return f"{value:.3g} {unit}" if isfinite(value) else "none, it ran away"
 
 
-def describe_holdout(name: str, item: HeldOut, *, improved: bool) -> str:
+def describe_holdout(name: str, item: "HeldOut", *, improved: bool) -> str:
     """Error of the simulation on held-out rows, in one line."""
     before = f", before {format_error(item.rmse_before, item.unit)}" if improved else ""
     return f"{name} off by {format_error(item.rmse_after, item.unit)}{before}; noise {item.noise_sd:.3g} {item.unit}"
 
 
-def describe_difference(name: str, item: Difference) -> str:
+def describe_difference(name: str, item: "Difference") -> str:
     """Error of the simulation, its share of noise, and the ranges where it is largest, in a sentence."""
     if not isfinite(item.rmse):
         return f"{name}: the simulation ran away from the record."
@@ -226,5 +225,58 @@ def _percent(share: float) -> str:
     return f"{100 * share:.0f} %" if share >= 0.01 else "less than 1 %"
 
 
-def _largest_min(cause: Cause, curves: Curves) -> float:
+def _largest_min(cause: "Cause", curves: "Curves") -> float:
     return float(curves.time_min[int(np.argmax(np.abs(curves.deviation[cause.cause])))])
+
+
+def diagnosis_text(diagnosis: "Diagnosis", effects: Sequence[Effect]) -> str:
+    """Verdict, causes with their 95 % intervals, gain, alternatives and remarks.
+
+    Args:
+        diagnosis: diagnosis of a record.
+        effects: the catalogue.
+    """
+    lines = [f"{diagnosis.file}: {diagnosis.samples} rows over {diagnosis.span_min:g} min", describe_verdict(diagnosis)]
+    ambiguous = diagnosis.verdict == "ambiguous"
+    if ambiguous:
+        lines += [_line("either", f"{describe_explanation(diagnosis.causes, effects)}  (95 %)")]
+        lines += _alternatives(diagnosis, effects) + _experiment(diagnosis)
+    for cause in () if ambiguous else diagnosis.causes:
+        lines += [
+            _line("cause", f"{cause.label} ({cause.cause}, {cause.profile})"),
+            _line("size", f"{describe_size(cause, effects)}  (95 %)"),
+            _line("when", describe_timing(cause, diagnosis.curves)),
+        ]
+    if len(diagnosis.locations) > 1:
+        places = [f"{describe_place(item.location)} ({item.delta_bic:.1f})" for item in diagnosis.locations]
+        lines.append(_line("where", f"{', '.join(places)}: worse in BIC"))
+    if diagnosis.law is not None:
+        lines += [_line(name, text) for name, text in law_rows(diagnosis.law)]
+    if diagnosis.verdict != "nominal":
+        lines.append(_line("evidence", f"{diagnosis.gain.delta_bic:,.1f} in BIC over the simulation as it was"))
+        lines += [_line("differs", describe_difference(name, item)) for name, item in diagnosis.differences.items()]
+    for name, known in diagnosis.parameters.items():
+        lines.append(_line("parameter", f"{name} {describe_parameter(known)}  (95 %)"))
+    for name, item in diagnosis.gain.held_out.items():
+        lines.append(_line("held out", describe_holdout(name, item, improved=diagnosis.is_extended)))
+    if not ambiguous:
+        lines += _alternatives(diagnosis, effects) + _experiment(diagnosis)
+    if diagnosis.causes and not diagnosis.alternatives:
+        lines.append(_line("or", "nothing else in the catalogue comes near"))
+    lines += [_line("note", remark) for remark in diagnosis.remarks]
+    return printable_lines(lines)
+
+
+def _alternatives(diagnosis: "Diagnosis", effects: Sequence[Effect]) -> list[str]:
+    return [
+        _line("or", f"{describe_explanation(item.explanation, effects)}, worse by {item.delta_bic:.1f} in BIC")
+        for item in diagnosis.alternatives
+    ]
+
+
+def _experiment(diagnosis: "Diagnosis") -> list[str]:
+    return [] if diagnosis.experiment is None else [_line("experiment", diagnosis.experiment.why)]
+
+
+def _line(key: str, text: str) -> str:
+    return f"  {key:<{INDENT - 2}}{text}"
