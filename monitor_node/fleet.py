@@ -1,24 +1,28 @@
-"""Monitor of a fleet: a dictionary of monitors, one for each plant.
+"""Fleet: a dictionary of monitors, one for each plant, its settings, and its division into shards.
 
 A plant is watched from the first liveliness token of one of its nodes, or from its first sample, if it is in this
 monitor's shard. Its publications are the same, value for value, as if it were monitored alone.
 
+Each monitor of a divided fleet has one shard: `2/5` is the second of five. A plant's shard follows from a digest of its
+name, the same on every machine and in every version, and never changes.
+
 Nothing here reads a clock or does I/O.
 """
 
+import re
 from collections.abc import Callable, Sequence
 from fnmatch import fnmatchcase
+from hashlib import blake2b
 from heapq import heappop, heappush
 from itertools import chain
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import msgspec
 
 from monitor_node.causes import stage
-from monitor_node.charts import drift
-from monitor_node.config import MonitorConfig
+from monitor_node.charts import shift_and_drift as drift
+from monitor_node.config import LARGEST_FALSE_ALARMS, LEAST_FALSE_ALARMS, MonitorConfig
 from monitor_node.core import Monitor
-from monitor_node.fleet.config import WHOLE, FleetConfig, Shard
 from monitor_node.learn.training_diagnosis import DiagnosisJob, Finding
 from monitor_node.watched_process import load_process
 from reactorwatch.contract import keys
@@ -29,23 +33,131 @@ from reactorwatch.identification.rls import RecursiveLeastSquares
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import NEVER_NS
 from reactorwatch.runtime.bus import Node
+from reactorwatch.runtime.config import check_bounds
+from reactorwatch.spc.false_alarm_budget import DAYS
 
-MOST_PLANTS = 100_000
 
-MOST_UNVERIFIED = 1000
-"""Plants that are not verified, of which each costs a monitor; at this limit further ones wait until there is room."""
+class Shard(NamedTuple):
+    """A shard of a fleet.
 
-PROVEN_ROWS = 32
-"""Aligned rows that verify a plant."""
+    Attributes:
+        number: number of the shard, from 1.
+        of: number of shards.
+    """
+
+    number: int
+    of: int
+
+    def __str__(self) -> str:
+        return f"{self.number}/{self.of}"
+
+    def has(self, plant: str) -> bool:
+        """True if a plant is in the shard."""
+        return self.of == 1 or shard_of(plant, self.of) == self.number
+
+
+WHOLE = Shard(1, 1)
+
+
+def parse_shard(text: str) -> Shard:
+    """Parse a shard.
+
+    >>> parse_shard("2/5")
+    Shard(number=2, of=5)
+
+    Raises:
+        InputError: the text is no shard.
+    """
+    match = re.fullmatch(r"(\d{1,4})/(\d{1,4})", text)
+    shard = Shard(int(match[1]), int(match[2])) if match is not None else Shard(0, 0)
+    if not 1 <= shard.number <= shard.of <= 1000:
+        raise InputError(f"shard must be like 2/5, the second of five, with at most 1000, got {text!r}")
+    return shard
+
+
+def shard_of(plant: str, of: int) -> int:
+    """Number of a plant's shard, from 1.
+
+    >>> [shard_of(plant, 3) for plant in ("a", "b", "c", "d")]
+    [3, 3, 1, 3]
+    """
+    return int.from_bytes(blake2b(plant.encode(), digest_size=8).digest(), "big") % of + 1
+
+
+class FleetConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Settings of a fleet; those of the monitor apply to each of its plants.
+
+    Attributes:
+        plants: key expression of the plants, such as `reactor/*`; None: one plant, that of the monitor's settings.
+        shard: own shard, such as `2/5`.
+        processes: process by plant, a name in the catalogue or a file; a key may be a pattern of plants such as
+            `north_*`, and a plant's own entry goes before patterns. Other plants have that of the monitor's settings.
+        state: folder of the plants' states, stored as often as the monitor's settings say, from which a restarted
+            monitor resumes. Only one monitor at a time uses a folder. None: nothing is stored.
+        false_alarms_per_day: number of false alarms a day of all plants together; each plant has the same share, so it
+            holds however the plants depend on each other. None: only each plant's own number is promised.
+        most_plants: largest number of plants among which it is divided.
+        points: True to publish estimates, chart points and models for every row.
+    """
+
+    plants: str | None = None
+    shard: str = "1/1"
+    processes: dict[str, str] = {}  # msgspec copies the default
+    state: str | None = None
+    false_alarms_per_day: Annotated[float, msgspec.Meta(ge=1e-4, le=1e6)] | None = None
+    most_plants: Annotated[int, msgspec.Meta(ge=1, le=100_000)] = 100
+    points: bool = False
+
+    def __post_init__(self) -> None:
+        if self.plants is not None:
+            keys.check_plants(self.plants)
+        try:
+            parse_shard(self.shard)
+        except InputError as error:
+            raise ValueError(str(error)) from error
+        check_bounds(FleetConfig, msgspec.structs.asdict(self))
+        share = self.share_per_30_days
+        if share is not None and not LEAST_FALSE_ALARMS <= share <= LARGEST_FALSE_ALARMS:
+            raise ValueError(
+                f"false_alarms_per_day over most_plants must be in [{LEAST_FALSE_ALARMS / DAYS:.2g}, "
+                f"{LARGEST_FALSE_ALARMS / DAYS:.2g}], got {self.false_alarms_per_day:g} over {self.divisor} plants"
+            )
+
+    @property
+    def divisor(self) -> int:
+        """Number of plants among which the false alarms of the fleet are divided."""
+        return self.most_plants if self.plants is not None and "*" in self.plants else 1
+
+    @property
+    def share_per_30_days(self) -> float | None:
+        """Share of a plant in the false alarms of the fleet, in 30 days; None: nothing is promised for the fleet."""
+        return None if self.false_alarms_per_day is None else DAYS * self.false_alarms_per_day / self.divisor
+
+    def describe_excess(self, plants: int) -> str | None:
+        """Text for more plants than share the false alarms of the fleet; None: there are not more."""
+        promised = self.false_alarms_per_day
+        if promised is None or plants <= self.divisor:
+            return None
+        return (
+            f"the fleet has {plants} plants, and false_alarms_per_day is divided among {self.divisor}: up to "
+            f"{promised * plants / self.divisor:.3g} false alarms a day may come; set [fleet] most_plants"
+        )
+
+    def share_promise(self, config: MonitorConfig) -> MonitorConfig:
+        """Settings of a plant's monitor with its share of the false alarms, or its own number where that is smaller."""
+        shares = [item for item in (self.share_per_30_days, config.false_alarms_per_30_days) if item is not None]
+        return msgspec.structs.replace(config, false_alarms_per_30_days=min(shares, default=None))
+
+
+ONE_PLANT = FleetConfig()
+"""Settings where there is no fleet: the one plant of the monitor's settings is watched."""
+
 
 EVICT_NS = 600_000_000_000
 """An unverified plant without a message in this time is evicted."""
 
 ANY = "*"
 """Pattern of all plants."""
-
-MOST_FOREIGN = 100_000
-"""Keys of samples of other shards that are remembered; senders choose the names."""
 
 
 class PlantKind(NamedTuple):
@@ -65,10 +177,6 @@ class PlantKind(NamedTuple):
 def load_kinds(config: MonitorConfig, fleet: FleetConfig) -> tuple[PlantKind, ...]:
     """Kinds of plants in a fleet; the last one has the pattern `ANY` and the process of the monitor's settings.
 
-    Args:
-        config: settings of each plant's monitor.
-        fleet: settings of the fleet.
-
     Raises:
         InputError: a process cannot be loaded, or does not fit the settings of the monitor.
     """
@@ -82,10 +190,6 @@ def load_kinds(config: MonitorConfig, fleet: FleetConfig) -> tuple[PlantKind, ..
 
 def prepare(kinds: Sequence[PlantKind], *, points: bool) -> None:
     """Compile the machine code of the first use, which takes ten seconds and more on a new machine.
-
-    Args:
-        kinds: kinds of plants.
-        points: see `Monitor`.
 
     Raises:
         InputError: the settings are inconsistent.
@@ -189,7 +293,7 @@ class FleetMonitor(Node):
             if verified:
                 self._active_ns.pop(plant, None)
             return
-        has_room = len(self._monitors) < MOST_PLANTS and (verified or len(self._active_ns) < MOST_UNVERIFIED)
+        has_room = len(self._monitors) < 100_000 and (verified or len(self._active_ns) < 1000)
         if not (has_room and self._shard.has(plant) and is_plant(plant)):
             return
         if not verified:
@@ -262,7 +366,7 @@ class FleetMonitor(Node):
         for monitor, own in by_monitor.items():
             publications += monitor.on_messages(own, now_ns)
             plant = monitor.config.plant
-            if self._active_ns and self._active_ns.pop(plant, None) is not None and monitor.rows < PROVEN_ROWS:
+            if self._active_ns and self._active_ns.pop(plant, None) is not None and monitor.rows < 32:
                 self._active_ns[plant] = now_ns
             self._schedule(plant, monitor)
         return publications
@@ -275,7 +379,8 @@ class FleetMonitor(Node):
         if topic is None or topic.kind != keys.SAMPLE:
             return None
         if not self._shard.has(topic.plant):
-            if len(self._foreign) < MOST_FOREIGN:
+            # senders choose the names
+            if len(self._foreign) < 100_000:
                 self._foreign.add(key)
             return None
         self.register(topic.plant, now_ns, verified=False)

@@ -1,12 +1,15 @@
-"""Samples become rows, whatever happens to them on the way."""
+"""Samples become rows, whatever happens to them on the way.
+
+The sampling period is learned from the first rows; a row follows, or rows are missing before it.
+"""
 
 import math
 import random
 
+import numpy as np
 import pytest
 
-from monitor_node.ingest.alignment import Aligner
-from monitor_node.ingest.rows import Row
+from monitor_node.ingest.rows import LEARN_FROM, Aligner, Row, SamplingPeriod, missing_in_intervals, regular_intervals
 
 SIGNALS = ("qc", "C", "T")
 PERIOD = 100
@@ -113,13 +116,6 @@ def test_the_same_sample_twice_is_a_duplicate_before_and_after_its_row_left(when
     assert aligner.memory.counts.lost == 0
 
 
-def test_a_duplicate_of_a_complete_row_is_no_late_sample() -> None:
-    aligner = Aligner(SIGNALS, 4)
-    feed(aligner, [*in_order(3), ("C", 1)])
-    assert aligner.memory.counts.duplicated == 1
-    assert aligner.memory.counts.late == 0
-
-
 def test_a_publisher_that_begins_again_begins_a_new_run() -> None:
     aligner = Aligner(SIGNALS, 2)
     feed(aligner, in_order(50))
@@ -134,13 +130,6 @@ def test_a_publisher_that_begins_again_begins_a_new_run() -> None:
     assert aligner.memory.counts.lost == 0
 
 
-def test_a_publisher_may_begin_again_at_an_earlier_time() -> None:
-    aligner = Aligner(SIGNALS, 2)
-    feed(aligner, in_order(50))
-    assert numbers(feed(aligner, in_order(3))) == [0, 1, 2]
-    assert aligner.memory.counts.late == 0
-
-
 def test_memory_is_bounded_whatever_comes() -> None:
     aligner = Aligner(SIGNALS, 5)
     source = random.Random(3)
@@ -153,12 +142,6 @@ def test_memory_is_bounded_whatever_comes() -> None:
 def test_a_reordering_of_nothing_is_refused() -> None:
     with pytest.raises(ValueError, match=r"reorder_rows must be at least 1, got 0"):
         Aligner(SIGNALS, 0)
-
-
-def test_every_row_is_counted() -> None:
-    aligner = Aligner(SIGNALS, 1)
-    rows = feed(aligner, [item for item in in_order(6) if item != ("T", 2)]) + aligner.flush()
-    assert aligner.memory.counts.rows == len(rows) == 6
 
 
 def test_the_end_of_a_record_gives_the_pending_rows_in_the_order_of_time() -> None:
@@ -276,5 +259,68 @@ def test_the_count_of_lost_samples_fits_into_a_message_whatever_the_numbers_are(
     assert aligner.memory.counts.restarts == 3
 
 
-def test_a_reordering_of_one_row_is_accepted() -> None:
-    assert numbers(feed(Aligner(SIGNALS, 1), in_order(3))) == [0, 1, 2]
+PERIOD_NS = 6_000_000_000
+
+
+def learned() -> SamplingPeriod:
+    """A period that was learned from even rows; the last is at time 0."""
+    sampling = SamplingPeriod()
+    for row in range(-LEARN_FROM, 1):
+        sampling.update(row * PERIOD_NS)
+    return sampling
+
+
+@pytest.mark.parametrize(
+    ("periods", "follows", "is_gap", "missing"),
+    [
+        (1.0, True, False, 0),
+        (1.09, True, False, 0),
+        (1.1, True, False, 0),
+        (0.9, True, False, 0),
+        (1.11, False, False, 0),
+        (0.2, False, False, 0),
+        (1.75, False, False, 1),
+        (2.0, False, False, 1),
+        (2.25, False, False, 1),
+        (2.26, False, False, 0),  # no whole number of periods
+        (2.5, False, False, 0),
+        (2.51, False, True, 0),
+        (3.1, False, True, 2),
+        (-1.0, False, True, 0),
+        (0.0, False, True, 0),
+    ],
+)
+def test_an_interval_follows_or_is_a_gap_by_its_length(
+    periods: float, follows: bool, is_gap: bool, missing: int
+) -> None:
+    assert learned().update(round(periods * PERIOD_NS)) == (follows, is_gap, missing)
+
+
+def test_the_first_row_follows_nothing_and_the_next_ones_the_shortest_interval_so_far() -> None:
+    sampling = SamplingPeriod()
+    assert sampling.period_ns == 0.0
+    intervals = [sampling.update(time_ns) for time_ns in (0, 100, 200, 340, 490, 650, 950)]
+    assert [item.follows for item in intervals] == [False, True, True, True, True, False, False]
+    assert [item.is_gap for item in intervals] == [False, False, False, False, False, False, True]
+    assert [item.missing for item in intervals] == [0] * 7
+    assert sampling.period_ns == 100.0
+
+
+def test_the_period_is_the_median_of_the_first_32_intervals() -> None:
+    sampling, time_ns = SamplingPeriod(), 0
+    sampling.update(time_ns)
+    for number in range(40):
+        time_ns += 100 + number
+        sampling.update(time_ns)
+        assert sampling.learned_ns == (None if number < 31 else 115.5)
+
+
+def test_a_record_has_the_same_regular_and_missing_intervals_as_its_rows_one_by_one() -> None:
+    """With the median of the record, which here is the one of the first rows."""
+    steps = np.random.default_rng(1).choice([*[1.0] * 8, 1.05, 1.3, 2.0, 3.0, 6.6], 400)
+    time_min = np.concatenate([np.arange(LEARN_FROM + 1), LEARN_FROM + np.cumsum(steps)]) * 0.1
+    sampling = SamplingPeriod()
+    intervals = [sampling.update(round(minutes * 6e10)) for minutes in time_min.tolist()][1:]
+    behind = slice(LEARN_FROM, None)
+    assert regular_intervals(time_min).tolist()[behind] == [item.follows for item in intervals][behind]
+    assert missing_in_intervals(time_min).tolist()[behind] == [item.missing for item in intervals][behind]

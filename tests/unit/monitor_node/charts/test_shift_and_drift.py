@@ -1,13 +1,20 @@
-"""A lasting step of a measurement is seen where the reference predicts from the last measurements, and follows it."""
+"""A lasting step of a measurement is seen where the reference predicts from the last measurements, and follows it.
+
+The limits of the drift are prepared for every memory that the adaptive models may come to have.
+"""
 
 import numpy as np
 import pytest
 
+from monitor_node.alarms.annunciator import Annunciator
+from monitor_node.charts import shift_and_drift as drift
 from monitor_node.config import MonitorConfig, ReferenceName
 from monitor_node.core import Monitor
+from monitor_node.learn.arx import JUDGING_FORGETTING, arx_structure
 from reactorwatch.arrays import Array
 from reactorwatch.contract.codec import Publication
 from reactorwatch.contract.messages_pb2 import Alarm, ChartPoint
+from reactorwatch.spc.charts.parameters import adaptive_weight, parameter_limit
 from tests.exchanger import Result, config_of, random_exchanger, simulate, watch
 
 from ..samples import feed_row, leaking_run, samples
@@ -94,3 +101,34 @@ def test_a_step_in_rows_that_are_not_judged_is_seen(reference: ReferenceName) ->
     result = watch(flow, measured, config_of(reference), [3.0], onsets)
     assert len(result.delays[3.0]) >= 8
     assert len(result.missed[3.0]) <= 0.1 * len(result.delays[3.0])
+
+
+@pytest.mark.parametrize(
+    ("reference", "memories"),
+    [
+        ("auto", {0.99, JUDGING_FORGETTING}),
+        ("arx", {JUDGING_FORGETTING}),
+        ("equations", {0.99}),
+        ("black-box", {0.99}),
+    ],
+)
+def test_no_limit_is_computed_after_the_preparation(
+    monkeypatch: pytest.MonkeyPatch, reference: ReferenceName, memories: set[float]
+) -> None:
+    config = MonitorConfig(reference=reference, forgetting=0.99, order=1)
+    for _ in drift.preparation(config, wanted=True):
+        pass
+
+    def fail(*_: object) -> float:
+        raise AssertionError("computed again")
+
+    monkeypatch.setattr("reactorwatch.spc.charts.parameters.mewma_run_length", fail)
+    for forgetting in memories:
+        assert parameter_limit(1e5, arx_structure(config).parameters, adaptive_weight(forgetting), 500.0, 0.1) > 0.0
+
+
+def test_nothing_is_prepared_for_a_drift_that_has_no_limit() -> None:
+    assert list(drift.preparation(MonitorConfig(), wanted=False)) == []
+    with_alarm = MonitorConfig(charts=("ewma", "parameters"))
+    assert drift.DriftWatch(with_alarm, Annunciator(with_alarm), publish=False).wanted
+    assert next(drift.preparation(with_alarm, wanted=False), "nothing") is None

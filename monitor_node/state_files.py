@@ -1,24 +1,111 @@
-"""Stored states: the file of one plant, or a fleet's folder of them.
+"""Stored states: the file of one plant, or a fleet's folder of them, which one monitor at a time uses.
 
 A file is written under a temporary name and renamed, so that a kill leaves the file before or this one, intact. An
 unusable state is kept aside under another name, never overwritten, and used again when it fits: one learned over months
 may be wanted back with the settings it was learned with; a damaged one may be worth a look. A file that is no state is
-left alone. Only one monitor at a time uses a file, and one fleet's monitor a folder (see `claims`).
+left alone.
+
+A monitor claims its file or folder. On a local file system a claim is a lock of the kernel (`flock`), which ends with
+the process, by whatever means; a second monitor is refused. Locks of a network file system may be local to each
+machine, or outlive a machine that is gone. So there a claim is a file with the token of the last monitor that claimed.
+The previous one may be stalled at any instruction, and not know that it was replaced. It reads the claim after it has
+evaluated messages and before it publishes an alarm or writes a state, so after a stall of any length before the check
+it does neither, and ends.
 """
 
 import contextlib
+import fcntl
+import os
 import re
+import secrets
 import threading
 import time
-from collections.abc import Iterable
+import weakref
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from monitor_node.core import Monitor
 from monitor_node.monitor_state import ForeignFileError, OtherSettingsError
-from monitor_node.storage.claims import Claim
 from reactorwatch.errors import InputError, is_passing
 from reactorwatch.records.decode import read_regular
 from reactorwatch.records.write import atomic_write, write_durably
+
+MOUNTS = Path("/proc/self/mountinfo")
+
+LOCAL = frozenset(
+    ("bcachefs", "btrfs", "ext2", "ext3", "ext4", "f2fs", "jfs", "overlay", "ramfs", "reiserfs", "tmpfs", "xfs", "zfs")
+)
+"""Linux's file systems on disks of the machine and in its memory, whose locks every process of the machine sees."""
+
+
+class Claim:
+    """Claim on a state file or a folder of states, until it is closed or the process ends.
+
+    Args:
+        path: file of the claim.
+        thing: what is claimed, as the errors name it.
+
+    Raises:
+        InputError: another monitor uses it.
+
+    Attributes:
+        failure: reason why it could not be claimed; empty: it is. Then no other monitor is refused.
+    """
+
+    def __init__(self, path: Path, thing: str) -> None:
+        self._path, self._thing, self.failure = path, thing, ""
+        self._token: bytes | None = None
+        self._close: Callable[[], object] = lambda: None
+        try:
+            file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_NONBLOCK, 0o644)  # a pipe is refused, not waited for
+            self._close = weakref.finalize(self, os.close, file)
+            if is_local(path.parent):
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                return
+            token = secrets.token_hex(16 // 2).encode()
+            os.write(file, token)
+            self._token = token
+        except BlockingIOError:
+            self._close()
+            raise InputError(f"{thing} is in use by another monitor; stop that, or name another") from None
+        except OSError as error:
+            self.failure = f"{thing}: cannot be claimed in {path}: {error.strerror}; another monitor may use it"
+        self._close()
+
+    def close(self) -> None:
+        """Give the claim up: the state is stored for the last time."""
+        self._close()
+
+    def check(self) -> None:
+        """Check that no other monitor has claimed it since.
+
+        Raises:
+            InputError: another monitor has.
+        """
+        if self._token is None:  # locked, or never claimed: a check would find the previous owner's for ever
+            return
+        try:
+            owner = read_regular(self._path, bounded=False)
+        except (InputError, OSError):
+            return
+        if len(owner) == 16 and owner != self._token:
+            raise InputError(f"{self._thing} was claimed by another monitor, which uses it from now on")
+
+
+def is_local(folder: Path) -> bool:
+    """True if a folder is certainly on a local file system."""
+    try:
+        lines = MOUNTS.read_text(encoding="utf-8", errors="replace").splitlines()
+    except OSError:
+        return False
+    resolved, kind, longest = str(folder.resolve()), "", -1
+    for line in lines:
+        mount, _, source = line.partition(" - ")
+        point = mount.split()[4].encode().decode("unicode_escape")  # blanks in names are \040
+        if len(point) >= longest and (resolved == point or resolved.startswith(point.rstrip("/") + "/")):
+            kind, longest = source.split()[0], len(point)
+    return kind in LOCAL
+
 
 DAMAGED, OTHER_SETTINGS = ".damaged", ".other-settings"
 
@@ -59,22 +146,11 @@ def find_kept_aside(folder: Path) -> dict[str, list[Path]]:
 
 ENDING, CLAIM = ".state", ".owner"
 
-MOST_PENDING = 100
-"""States of a fleet that wait for the disk; at this limit only those of changed alarms are added."""
-
 RESUMED = "the monitor resumes from it"
-
-LEFT_S = 600.0
-"""A temporary file this old was left by a writer that was killed."""
 
 
 def restore(path: Path, monitor: Monitor, asides: Iterable[Path]) -> str:
     """Restore a monitor from its file, or from one that was kept aside and fits now; returns a text for the log.
-
-    Args:
-        path: the file.
-        monitor: the monitor.
-        asides: files that were kept aside.
 
     Raises:
         ForeignFileError: the file is no state; it is left as it is.
@@ -176,7 +252,7 @@ class StateStore:
     @property
     def has_room(self) -> bool:
         """True while the disk keeps up."""
-        return len(self._queued) < MOST_PENDING
+        return len(self._queued) < 100
 
     def put(self, plant: str, state: bytes) -> None:
         """Write a state, or queue it in place of a queued one of the plant; see `pop_failures`."""
@@ -219,7 +295,8 @@ class StateStore:
         except InputError as error:
             if not is_passing(error):
                 raise InputError(f"{self._name}: {error}") from error
-        oldest_s = time.time() - LEFT_S
+        # a file this old was left by a writer that was killed
+        oldest_s = time.time() - 600.0
         for path in self._path.glob(f".*{ENDING}.*.tmp"):
             with contextlib.suppress(OSError):
                 if path.stat().st_mtime < oldest_s:

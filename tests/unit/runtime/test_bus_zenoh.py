@@ -1,13 +1,30 @@
-"""Large blocks are taken from the system and given back, however many there were before."""
+"""Messages as they come from Zenoh, and the memory of a session: large blocks are given back to the system."""
 
 import ctypes
 import os
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import pytest
+import zenoh
 
+from reactorwatch.runtime.bus_zenoh.messages import MAX_KEY, SEQUENCE_ATTACHMENT, SampleReader
 from reactorwatch.runtime.bus_zenoh.sessions import LARGE_BYTES
+
+
+@pytest.mark.parametrize(("length", "is_numbered"), [(MAX_KEY, True), (MAX_KEY + 1, False), (60_000, False)])
+def test_a_key_longer_than_any_of_the_contract_is_not_put_in_order(length: int, is_numbered: bool) -> None:
+    """The names of streams are kept, so that a made-up key of 65,535 characters would take as many bytes."""
+    sample = SimpleNamespace(
+        key_expr="x" * length,
+        encoding=zenoh.Encoding.ZENOH_BYTES,
+        payload=zenoh.ZBytes(b"1"),
+        attachment=zenoh.ZBytes(SEQUENCE_ATTACHMENT.pack(3, 4)),
+    )
+    publisher, message = SampleReader().read(sample, 5)  # type: ignore[arg-type]
+    assert (publisher, message.payload, len(message.key)) == ((3, 4) if is_numbered else None, b"1", length)
+
 
 SIZES = f"""
 import ctypes, sys
@@ -25,8 +42,6 @@ for _ in range(3):
     del block
 """
 
-pytestmark = pytest.mark.skipif(not hasattr(ctypes.CDLL(None), "mallinfo2"), reason="the C library is not glibc")
-
 
 def taken_one_by_one(how: str) -> list[bool]:
     """Of three large blocks, one after the other: True if it was taken from the system by itself."""
@@ -36,6 +51,7 @@ def taken_one_by_one(how: str) -> list[bool]:
     return [int(line) >= 2 * LARGE_BYTES for line in printed.split()]
 
 
+@pytest.mark.skipif(not hasattr(ctypes.CDLL(None), "mallinfo2"), reason="the C library is not glibc")
 def test_a_large_block_is_taken_from_the_system_also_after_one_was_freed() -> None:
     assert taken_one_by_one("limited") == [True, True, True]
     assert taken_one_by_one("as it is") == [True, False, False]
