@@ -14,8 +14,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from benchmarks.outside.command import run
-from benchmarks.outside.scores import Row
+from benchmarks.outside.scores import Row, run
 from reactorwatch.errors import InputError
 
 MODELS = ("arx", "oe", "armax", "bj", "narx", "noe")

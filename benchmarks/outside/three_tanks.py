@@ -10,8 +10,7 @@ import re
 import tempfile
 from pathlib import Path
 
-from benchmarks.outside.command import run
-from benchmarks.outside.scores import Row
+from benchmarks.outside.scores import Row, run
 
 TRUTH: dict[int, tuple[tuple[str, ...], tuple[str, ...]]] = {
     1: (("pump1", "pump2"), ("pump1", "pump2", "tank1", "tank2")),

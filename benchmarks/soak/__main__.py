@@ -17,8 +17,7 @@ from pathlib import Path
 
 from benchmarks.soak.findings import Findings, assess, count_unaccounted
 from benchmarks.soak.plan import KNOWN_ROWS, Plan, draw_plan
-from benchmarks.soak.site import MONITORS, Site
-from benchmarks.soak.witness import Witness
+from benchmarks.soak.site import MONITORS, Site, Witness
 from reactorwatch.runtime.node_main import configure_log
 
 MINUTES, PLANTS = 10.0, 200

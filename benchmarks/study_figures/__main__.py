@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from benchmarks.harness.pool import Pool
 
 if TYPE_CHECKING:
-    from benchmarks.study_figures.figure import Figure, Finding
+    from benchmarks.study_figures.study import Figure, Finding
 
 PAGE = "study.md"
 
@@ -59,8 +59,7 @@ def reproduce(
 
 def draw(job: Job) -> "Finding":
     """Draw a figure."""
-    from benchmarks.study_figures.figure import paper
-    from benchmarks.study_figures.study import Study
+    from benchmarks.study_figures.study import Study, paper
 
     (figure,) = (item for item in _entries(job.data) if item.key == job.key)
     with paper(job.picture, figure.height_px) as drawing:

@@ -8,8 +8,8 @@ figures 1 and 2 show no result: a block diagram and a drawing of the reactor.
 from collections.abc import Sequence
 from functools import partial
 
-from benchmarks.study_figures import controllers, fault_records, flow_chart, models, plant, sampling
-from benchmarks.study_figures.figure import Figure, Finding
+from benchmarks.study_figures import fault_records, flow_chart, models, plant, sampling
+from benchmarks.study_figures.study import Figure, Finding
 
 _ORDERS = {1: "first", 2: "second", 3: "third"}
 _RECORDS = {
@@ -101,18 +101,6 @@ FIGURES: tuple[Figure, ...] = (
         "Phase plane",
         "The nonlinear plant has several steady states.",
         plant.phase_plane,
-    ),
-    Figure(
-        "section-temperature-control",
-        "Proportional temperature controller",
-        "A proportional controller of the temperature moves the coolant flow.",
-        controllers.temperature,
-    ),
-    Figure(
-        "section-level-control",
-        "Level controller",
-        "A level controller moves the outlet flow; the equations take the volume as constant.",
-        controllers.level,
     ),
     Figure(
         "section-excitation",

@@ -16,20 +16,20 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Drawing
 
 import reactorwatch as rw
-from benchmarks.study_figures.figure import (
+from benchmarks.study_figures.report_scheme import chart_output
+from benchmarks.study_figures.study import (
     BLACK,
     BLUE,
     ORANGE,
     VERMILION,
     Figure,
     Finding,
+    Study,
     Verdict,
     label,
     legend_below,
     panels,
 )
-from benchmarks.study_figures.report_scheme import chart_output
-from benchmarks.study_figures.study import Study
 from reactorwatch.arrays import Array
 from reactorwatch.description.read import find_process
 

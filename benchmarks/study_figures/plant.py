@@ -4,22 +4,25 @@ import numpy as np
 from matplotlib.figure import Figure as Drawing
 from scipy.optimize import brentq
 
-from benchmarks.study_figures.figure import (
+from benchmarks.study_figures.study import (
     BLACK,
     BLUE,
     GREEN,
+    NAMES,
     ORANGE,
     PURPLE,
     SKY,
     VERMILION,
     Finding,
+    Study,
     Verdict,
+    edge,
     label,
     legend_below,
     panels,
+    row_times,
     verdict,
 )
-from benchmarks.study_figures.study import NAMES, Study, edge, row_times
 from reactorwatch.process.library.cstr import OPERATING_COOLANT_FLOW
 from reactorwatch.process.steady_state import StepComparison, compare_step
 

@@ -24,7 +24,7 @@ from benchmarks.harness.site import (
     connect_client,
     recorder_process,
 )
-from benchmarks.link_cuts import Whose, cut, kill_router, read_content, stick
+from benchmarks.losses import Whose, cut, kill_router, read_content, stick
 from reactorwatch.cli.info import info_text
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, decode

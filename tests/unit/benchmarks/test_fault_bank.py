@@ -8,6 +8,7 @@ import pytest
 from rich.console import Console
 from scipy import stats
 
+from benchmarks.faults.__main__ import print_fault_free, print_summary, print_table, quantiles
 from benchmarks.faults.detectors import (
     METHODS,
     TRAINING_ROWS,
@@ -36,7 +37,6 @@ from benchmarks.faults.study import (
     run_case,
     run_fault_free,
 )
-from benchmarks.faults.tables import print_fault_free, print_summary, print_table, quantiles
 from benchmarks.harness.bank import (
     AFTER_MIN,
     BANK,

@@ -10,14 +10,13 @@ from PIL import Image
 from scipy.integrate import solve_ivp
 from scipy.optimize import fsolve
 
-from benchmarks.study_figures import figure as canvas
+from benchmarks.study_figures import study as canvas
 from benchmarks.study_figures.__main__ import reproduce
 from benchmarks.study_figures.catalogue import FIGURES
-from benchmarks.study_figures.figure import Finding, Verdict
 from benchmarks.study_figures.measured_records import FAULTS, TITLE, measured_figure
 from benchmarks.study_figures.models import ThirdOrder
 from benchmarks.study_figures.sampling import report_choice
-from benchmarks.study_figures.study import Study
+from benchmarks.study_figures.study import Finding, Study, Verdict
 from reactorwatch.identification.selection import Candidate, Selection
 
 DOCS = Path(__file__).parents[3] / "docs"
@@ -182,14 +181,6 @@ def test_a_single_sinusoid_is_refused_for_two_lags_and_more_and_the_others_are_n
     assert "| single sinusoid | accepted | refused | refused |" in finding.text
     for name in ("sum of three sinusoids", "square wave"):
         assert f"| {name} | accepted | accepted | accepted |" in finding.text
-
-
-def test_the_controller_s_offset_is_the_flow_s_over_the_gain(study: Study, tmp_path: Path) -> None:
-    finding = find(study, "section-temperature-control", tmp_path)
-    rows = re.findall(r"^\| ([\d.]+) \| ([-+.\d]+) \| [-+.\d]+ \| ([\d.]+) \|$", finding.text, re.MULTILINE)
-    assert len(rows) == 3
-    for gain, off, flow in rows:
-        assert float(off) == pytest.approx((float(flow) - 103.41) / float(gain), abs=0.01)
 
 
 def selection(free_runs: tuple[float, float, float], bics: tuple[float, float, float]) -> Selection:
