@@ -227,9 +227,6 @@ def test_settling_rows_follow_gaps_and_missing_values() -> None:
 U, Y = ARX.simulate(200, 1)
 
 
-U, Y = ARX.simulate(200, 1)
-
-
 @pytest.mark.parametrize("model", MODELS)
 @pytest.mark.parametrize(
     ("u", "y", "text"),
