@@ -24,8 +24,8 @@ import numpy as np
 from benchmarks.harness.plants import draw_bad_value
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
-from monitor_node.fleet.monitor import ANY, FleetMonitor, PlantKind
-from monitor_node.learn.signal_range import signal_ranges
+from monitor_node.fleet import ANY, FleetMonitor, PlantKind
+from monitor_node.watched_process import signal_ranges
 from plant_node.config import PlantConfig
 from plant_node.node import PlantNode
 from plant_node.record import plant_from, simulate_record

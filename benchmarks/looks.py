@@ -25,7 +25,7 @@ from monitor_node.causes.stage import FEW_ROWS, LOOKS, ROWS_BEFORE, preparation
 from monitor_node.causes.window import Row
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
-from monitor_node.learn.signal_range import signal_ranges
+from monitor_node.watched_process import signal_ranges
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from reactorwatch.contract.codec import encode

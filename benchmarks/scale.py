@@ -35,8 +35,8 @@ import zenoh
 from monitor_node.__main__ import UNCACHED, watch
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
-from monitor_node.fleet.config import FleetConfig
-from monitor_node.monitor_state import SEAL
+from monitor_node.fleet import FleetConfig
+from monitor_node.monitor_state import open_seal, seal
 from monitor_node.node import MonitorNode
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
@@ -167,12 +167,12 @@ class Counting(MonitorNode):
                 super().on_messages(messages[index : index + 1], start_ns + index * 10**9)
         trained = self.monitor(plant_name(0))
         assert trained.pipeline.evaluation.is_ordinary
-        body, few = SEAL.open(trained.to_bytes()), max(plants // 10, 1)
+        body, few = open_seal(trained.to_bytes()), max(plants // 10, 1)
         for number in range(1, plants):
             if number == few:
                 before = memory_bytes()
             name = plant_name(number)
-            state = SEAL.close(body.replace(plant_name(0).encode(), name.encode()))
+            state = seal(body.replace(plant_name(0).encode(), name.encode()))
             self.register(name, time.time_ns(), verified=True, restore=partial(_restore, state))
         self.on_history_end()
         return (memory_bytes() - before) // (plants - few) if plants > few else 0

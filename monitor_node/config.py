@@ -78,10 +78,6 @@ DEFAULT_PRIORITIES: dict[str, PriorityName] = msgspec.convert(DEFAULT.watch.prio
 """Priorities where none are stated; the same object, so that it is recognised."""
 
 
-PERIOD_ERROR = 0.01
-"""Rows by which a training may be short of its minutes, since a sampling period is rounded to nanoseconds."""
-
-
 class TrainingLength(NamedTuple):
     """Duration of a training.
 
@@ -97,7 +93,8 @@ class TrainingLength(NamedTuple):
         """Number of rows of the training at a sampling period."""
         if self.minutes is None:
             return self.rows
-        return max(1, ceil(self.minutes / period_min - PERIOD_ERROR))
+        # a sampling period is rounded to nanoseconds
+        return max(1, ceil(self.minutes / period_min - 0.01))
 
 
 class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):

@@ -17,7 +17,7 @@ from benchmarks.harness.site import Proxy, Router, connect_client
 from benchmarks.soak import garbage, publisher
 from benchmarks.soak.findings import Taken, own_memory_mb
 from benchmarks.soak.plan import Blow, Plan
-from monitor_node.fleet.config import FleetConfig
+from monitor_node.fleet import FleetConfig
 from monitor_node.health import NODE
 from reactorwatch.cli.processes import write_settings
 from reactorwatch.contract import keys

@@ -103,12 +103,7 @@ class CommandRateLimiter:
         self._all = {True: (ALL.at_once, 0), False: (ALL.at_once, 0)}  # with a name, without
 
     def check(self, name: str, now_ns: int) -> str | None:
-        """Count a command; returns the reason for its refusal, None if it is accepted.
-
-        Args:
-            name: sender's name in the command; empty: none.
-            now_ns: the time.
-        """
+        """Count a command; returns the reason for its refusal, None if it is accepted."""
         left_all = _level(self._all[bool(name)], ALL, now_ns)
         left = _level(self._names.pop(name, (PER_NAME.at_once, now_ns)), PER_NAME, now_ns) if name else left_all
         refused = left < 1.0 or left_all < 1.0

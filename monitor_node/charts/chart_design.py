@@ -54,9 +54,6 @@ def _count_alarms(names: Iterable[str], outputs: int, signals: int) -> int:
 class ChartDesign:
     """Design of the charts of one plant.
 
-    Args:
-        config: configuration of the monitor.
-
     Attributes:
         names: charts of the settings, and those that may take their place.
         chosen: charts that are made, by name.

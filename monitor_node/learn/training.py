@@ -43,11 +43,6 @@ class TrainingMemory(Memory):
 class Training:
     """The training of one plant.
 
-    Args:
-        config: settings of the monitor.
-        model: process model of the plant; None if there is none.
-        models: identified models, which start again with each training.
-
     Attributes:
         memory: the rows so far, and the refusals before.
         refused: reason of the last refusal; empty before one.
@@ -73,12 +68,7 @@ class Training:
         self.memory.rows, self.memory.began_ns = self._no_rows, time_ns
 
     def refuse(self, reason: str, time_ns: int) -> str:
-        """Refuse the training, and start it again; returns a note.
-
-        Args:
-            reason: reason of the refusal.
-            time_ns: time of the first row of the next one.
-        """
+        """Refuse the training, and start it again; returns a note."""
         self.memory.refusals, self.refused = self.memory.refusals + 1, reason
         self.restart(time_ns)
         return f"the training starts again: {reason}"
@@ -94,11 +84,7 @@ class Training:
         self.memory.rows.keeps_all = True
 
     def is_enough(self, timed_out: Sequence[bool] = ()) -> bool:
-        """True if there are enough rows with a value of each output.
-
-        Args:
-            timed_out: one flag an output: its data timeout is active, so it is disregarded; empty: none is.
-        """
+        """True if there are enough rows with a value of each output, but for those whose data timeout is active."""
         counts = self.memory.rows.counts
         if timed_out:
             counts = list(compress(counts, map(not_, timed_out)))
@@ -110,12 +96,7 @@ class Training:
             self.memory.began_ns = time_ns
 
     def share(self, period_ns: float, rows_before: int = 0) -> float:
-        """Share of the training that is done, at most 1.
-
-        Args:
-            period_ns: sampling period; 0: not known.
-            rows_before: number of rows in other modes, which count as well.
-        """
+        """Share of the training that is done, at most 1; rows before it, in other modes, count as well."""
         if not period_ns:
             return 0.0
         rows, wanted = self.memory.rows, self._config.training_length.count_rows(period_ns / MINUTE_NS)
@@ -127,11 +108,7 @@ class Training:
         return self._models.adapt(row)
 
     def finish(self, *, last_chance: bool | None = None) -> TrainingResult:
-        """Learn from the rows.
-
-        Args:
-            last_chance: True to use the training even if it is disturbed; None: after some refusals.
-        """
+        """Learn from the rows, even if they are disturbed at the last chance: as given, or after some refusals."""
         rows, self.memory.rows = self.memory.rows, self._no_rows
         is_last = self.memory.refusals >= MOST_REFUSALS if last_chance is None else last_chance
         self.trained_rows = len(rows.times)
@@ -139,9 +116,6 @@ class Training:
 
     def finish_early(self, *, times: int = 1) -> TrainingResult:
         """Learn from the rows so far.
-
-        Args:
-            times: times the fewest rows that a training needs, for which this one must do.
 
         Raises:
             InputError: there are too few rows to learn from, or no output can be watched.

@@ -165,7 +165,7 @@ def _conclude(folder: Path, recording: Path, monitor: MonitorConfig, fault: str)
     """Diagnose and draw the recording, and write the summary; returns the exit code."""
     from reactorwatch.api.diagnosis import diagnose_case
     from reactorwatch.cli.diagnose import DRAWING, MODEL, PAGE, DiagnosisOptions, load_case, write_report
-    from reactorwatch.diagnosis.report.words import describe_verdict
+    from reactorwatch.sentences.diagnosis import describe_verdict
     from recorder.columns import read_segments
     from recorder.view.file import write_rrd
 
@@ -197,7 +197,7 @@ def _conclude(folder: Path, recording: Path, monitor: MonitorConfig, fault: str)
     lines = [
         "# What happened",
         "",
-        headline(delay_s, diagnosis, diagnosis.effects),
+        headline(delay_s, diagnosis.result, diagnosis.effects),
         "",
         f"- Fault injected: `{fault}`, onset at {minutes(onset_ns)}."
         if onset_ns is not None
@@ -221,7 +221,7 @@ def _conclude(folder: Path, recording: Path, monitor: MonitorConfig, fault: str)
         + (", ".join(f"`{alarm.alarm}` at {minutes(alarm.time_ns)}" for alarm in before) or "none")
         + f" ({again.expected_false_alarms:.2g} expected in the whole run)."
     )
-    lines.append(f"- Diagnosis of the whole recording: {describe_verdict(diagnosis)}")
+    lines.append(f"- Diagnosis of the whole recording: {describe_verdict(diagnosis.result)}")
     lines.append(f"- Back-test over the recording: {'the same alarms, value for value' if same else 'OTHER ALARMS'}.")
     lines += [
         "",

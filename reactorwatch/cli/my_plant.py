@@ -137,7 +137,7 @@ def monitor(
 
     from monitor_node.__main__ import run
     from monitor_node.config import MonitorConfig
-    from monitor_node.fleet.config import FleetConfig
+    from monitor_node.fleet import FleetConfig
     from monitor_node.watched_process import load_process
     from reactorwatch.cli.bus_client import metrics_settings, node_settings
     from reactorwatch.cli.kernels import compile_at_first_start, is_first_start

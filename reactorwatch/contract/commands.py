@@ -8,8 +8,8 @@ from reactorwatch.contract import keys
 from reactorwatch.contract.codec import DecodeError, Encoded, decode, encoding_of
 from reactorwatch.errors import InputError
 
-MAX_NAME = 64
-MAX_COMMENT = 1000
+MAX_NAME = 64  # as long as the name of a plant
+MAX_COMMENT = 1000  # some sentences; every alarm carries it
 
 
 def decode_command(question: Encoded, catalogue: Mapping[str, type[Message]]) -> tuple[str, Message]:

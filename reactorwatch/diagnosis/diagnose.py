@@ -38,11 +38,13 @@ from reactorwatch.diagnosis.result import (
     NAMED,
     NOMINAL,
     UNKNOWN,
+    Adequacy,
     Alternative,
     Curves,
     Diagnosis,
     Gain,
     HeldOut,
+    LocationEvidence,
 )
 from reactorwatch.diagnosis.run import Run
 from reactorwatch.diagnosis.search.noise import search_noise_growth, search_single_cause
@@ -192,26 +194,30 @@ def diagnose(
         if reported is None or unknown is None
         else describe_law(adjusted, run, unknown.found, reported, covariances, gain.held_out)
     )
+    worse = _locations(best, alternatives) if unknown is None else unknown.locations
     return Diagnosis(
+        file=record.name,
+        zero=record.zero,
         samples=run.time_min.size,
+        runs=len(record.run_starts),
         span_min=record.span_min,
+        seconds=0.0,
         verdict=verdict,
         causes=causes,
         alternatives=tuple(_alternative(search, item, result.noise, best.bic, record) for item in alternatives),
-        location=location,
+        location=location or None,
+        locations=tuple(LocationEvidence(name, bic) for name, bic in worse.items()),
+        law=described,
         significant=verdict != NOMINAL,
-        practical=unexplained or exceeds_tolerance(curves, bands, blind),
-        differences=differences_of(model, noise_sd, curves),
+        practical=bool(unexplained or exceeds_tolerance(curves, bands, blind)),
         gain=gain,
-        adequacy=dict(zip(model.output_names, adequacy.tolist(), strict=True)),
+        adequacy={name: Adequacy(item) for name, item in zip(model.output_names, adequacy.tolist(), strict=True)},
         experiment=experiment,
         extended_model=extended_model(adjusted, effects, causes, record.zero_ns, reported),
-        remarks=tuple(remarks),
         parameters=parameters,
+        differences=differences_of(model, noise_sd, curves),
+        remarks=tuple(remarks),
         curves=curves,
-        runs=len(record.run_starts),
-        locations=_locations(best, alternatives) if unknown is None else unknown.locations,
-        law=described,
     )
 
 

@@ -21,6 +21,7 @@ from math import inf, sqrt
 from typing import Any
 
 import numpy as np
+from msgspec import structs
 
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.compiled_function import LANES
@@ -265,8 +266,8 @@ def adjusted_parameters(
     result = {}
     for name, stated_sd in uncertain.items():
         item, about = model.parameter(name), best.hypothesis.filter.model.parameter(name)
-        estimate = Estimate(about.value + offsets.get(name, 0.0), sds[name], item.unit)
-        result[name] = AdjustedParameter(item.value, stated_sd, estimate)
+        value = about.value + offsets.get(name, 0.0)
+        result[name] = AdjustedParameter(item.value, stated_sd, value, sds[name], item.unit)
     return result
 
 
@@ -277,7 +278,7 @@ def convert_to_run_minutes(causes: Sequence[Cause], record: Record) -> tuple[Cau
         causes: causes with times that increase over all runs (`Record.continuous_min`).
         record: record that they explain.
     """
-    if record.runs is None:
+    if len(record.run_starts) == 1:
         return tuple(causes)
     starts_min = record.continuous_min[list(record.run_starts)]
     result = []
@@ -288,10 +289,10 @@ def convert_to_run_minutes(causes: Sequence[Cause], record: Record) -> tuple[Cau
         run = max(int(np.searchsorted(starts_min, first_min, side="right")), 1)
         shift_min = record.run_shifts_min[run - 1]
         parameters = {
-            name: replace(item, value=item.value - shift_min) if name in times else item
+            name: structs.replace(item, value=item.value - shift_min) if name in times else item
             for name, item in cause.parameters.items()
         }
-        result.append(replace(cause, parameters=parameters, run=run, run_shift_min=shift_min))
+        result.append(structs.replace(cause, parameters=parameters, run=run, run_shift_min=shift_min))
     return tuple(result)
 
 
@@ -323,7 +324,13 @@ def causes_of(best: FittedHypothesis, covariances: Sequence[Array]) -> list[Caus
             sd = sqrt(max(float(part[index, index]), 0.0))
             parameters[constant.name] = Estimate(float(fitted[index]), sd, constant.unit)
         causes.append(
-            Cause(effect.name, profile.name, effect.labels.get(profile.name, effect.label), effect.location, parameters)
+            Cause(
+                cause=effect.name,
+                profile=profile.name,
+                label=effect.labels.get(profile.name, effect.label),
+                location=effect.location,
+                parameters=parameters,
+            )
         )
     return causes
 

@@ -97,7 +97,7 @@ ROLES = (
 
 REVOKED = "revoked"
 """Subject of the rules for revoked certificates: Zenoh 1.10 reads no certificate revocation lists."""
-SERIAL_BYTES = 4
+SERIAL_BYTES = 4  # at the end of a certificate's name: four billion of a role
 _SERIAL = re.compile(rf"\.[0-9a-f]{{{2 * SERIAL_BYTES}}}$")
 NO_NAMES: Mapping[str, str] = MappingProxyType({})
 EVERY_MESSAGE = (

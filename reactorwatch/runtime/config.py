@@ -35,13 +35,12 @@ MODEL_IS_PROCESS: OlderKeys = types.MappingProxyType({"model": ("process", lambd
 PROTOCOLS = ("tcp", "tls", "udp", "ws")
 """Protocols of an endpoint."""
 
-LAST_PORT = 65535
+LAST_PORT = 65535  # 16 bits
 
 MAX_SPAN_S = 2.0**62 / 1e9
 """146 years: sums of times must still fit 64 bits of nanoseconds."""
 
 _SECONDS = {"s": 1.0, "min": 60.0, "h": 3600.0, "days": 86_400.0}
-_MAX_BITS = 63
 
 
 def check_values(values: object, name: str = "") -> None:
@@ -63,7 +62,7 @@ def check_values(values: object, name: str = "") -> None:
             check_values(value, name)
     elif isinstance(values, str) and "\0" in values:
         raise ValueError(f"{name} must not hold the character NUL, got {values!r}")
-    elif isinstance(values, int) and values.bit_length() > _MAX_BITS:
+    elif isinstance(values, int) and values.bit_length() > 63:
         raise ValueError(f"{name} must be a number of 64 bits, got one of {values.bit_length()}")
 
 

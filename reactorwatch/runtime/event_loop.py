@@ -22,18 +22,18 @@ from reactorwatch.runtime.acl import audit
 from reactorwatch.runtime.bus import MAX_BATCH, Bus, Node, Request
 from reactorwatch.runtime.reorder_buffer import Gap
 
-MAX_WAIT_S = 3600.0
 MAX_DRAIN_FACTOR = 10
 """Multiple of `drain_timeout_s` after which a node ends although messages still arrive."""
 MAX_INBOX_MESSAGES = 100_000
 MAX_INBOX_BYTES = 64 << 20  # of payload
 """Beyond either the bus's thread is blocked, and with it the publishers that are too fast for the node."""
-POLL_S = 0.1
+POLL_S = 0.1  # a person does not notice it
 _END = b"\0"  # no signal has this number
 BATCH = 256  # messages after which no further item is handled before the loop reads the clock again
 
 
-_Item: TypeAlias = tuple[Callable[..., list[Publication]], tuple[object, ...], int, int]
+_Handler: TypeAlias = Callable[..., list[Publication]]
+_Item: TypeAlias = tuple[_Handler, tuple[object, ...], int, int]
 """A function whose result is published, its arguments before the time, and the messages and payload bytes in these.
 
 A plain tuple is made in an eighth of the time of a named one, and the loop takes one a message."""
@@ -62,13 +62,7 @@ class _Inbox:
         stop.call_on_set(lambda: self.put(_no_publications))
         stop.call_on_set(self._room.set)
 
-    def put(
-        self,
-        function: Callable[..., list[Publication]],
-        arguments: tuple[object, ...] = (),
-        messages: int = 0,
-        payload: int = 0,
-    ) -> None:
+    def put(self, function: _Handler, arguments: tuple[object, ...] = (), messages: int = 0, payload: int = 0) -> None:
         """Append a function to call; from threads of the bus. One with messages blocks until there is room."""
         if messages:
             while self._is_full and not (self._stop.is_set or self._closed or self._is_blocked):
@@ -243,10 +237,8 @@ class EventLoop:
         on_publish: Callable[[Publication], None] | None = None,
         on_backlog: Callable[[bool], None] = lambda _has_backlog: None,
     ) -> None:
-        self._on_backlog = on_backlog
         self._node, self._bus, self._stop = node, bus, stop
-        self._drain_timeout_s = drain_timeout_s
-        self._on_publish = on_publish
+        self._drain_timeout_s, self._on_publish, self._on_backlog = drain_timeout_s, on_publish, on_backlog
         self._clock = SteadyClock()
         self._inbox = _Inbox(stop)
         self._published = 0
@@ -275,12 +267,12 @@ class EventLoop:
         def put_message(message: Encoded) -> None:
             self._inbox.put(self._node.on_message, (message,), 1, len(message.payload))
 
-        def put_batch(handle: Callable[[list[Encoded], int], list[Publication]], messages: list[Encoded]) -> None:
+        def put_batch(handle: _Handler, messages: list[Encoded]) -> None:
             for start in range(0, len(messages), MAX_BATCH):  # a history comes at once: many thousands
                 part = messages[start : start + MAX_BATCH]
                 self._inbox.put(handle, (part,), len(part), sum([len(message.payload) for message in part]))
 
-        def put_gap(handle: Callable[[Gap, int], list[Publication]], gap: Gap) -> None:
+        def put_gap(handle: _Handler, gap: Gap) -> None:
             self._inbox.put(handle, (gap,), 1)
 
         def end_history(on_end: Callable[[], None], _now_ns: int) -> list[Publication]:
@@ -293,11 +285,9 @@ class EventLoop:
         for expression in key_expressions:
             subscribe(
                 expression,
-                on_gap=None if on_gap is None else partial(put_gap, on_gap),
+                on_gap=on_gap and partial(put_gap, on_gap),
                 history_s=history_s,
-                on_history_end=None
-                if on_history_end is None
-                else partial(self._inbox.put, end_history, (on_history_end,)),
+                on_history_end=on_history_end and partial(self._inbox.put, end_history, (on_history_end,)),
             )
 
     def call(self, function: Callable[[int], list[Publication]]) -> None:
@@ -341,14 +331,14 @@ class EventLoop:
             self._on_backlog(self._inbox.has_backlog)
             self._publish(self._node.on_tick(self._clock.now_ns()))
         handled = 0
-        while handled < BATCH and (messages := self._handle_next(min(wait_s, MAX_WAIT_S))):
+        while handled < BATCH and (messages := self._handle_next(min(wait_s, 3600.0))):
             handled += messages
             wait_s = 0.0
 
     def _drain(self) -> None:
         """Handle messages that were on their way when the stop was requested."""
-        deadline = time.monotonic() + MAX_DRAIN_FACTOR * self._drain_timeout_s
         left_s = MAX_DRAIN_FACTOR * self._drain_timeout_s
+        deadline = time.monotonic() + left_s
         while left_s > 0 and self._handle_next(min(self._drain_timeout_s, left_s)):
             left_s = deadline - time.monotonic()
         self._handle_rest()
@@ -360,8 +350,7 @@ class EventLoop:
 
     def _handle_next(self, timeout_s: float) -> int:
         """Handle the next item; returns the number of its messages, at least 1, or 0 if none arrived in time."""
-        item = self._inbox.get(timeout_s)
-        if item is None:
+        if (item := self._inbox.get(timeout_s)) is None:
             return 0
         function, arguments, messages, _ = item
         self._publish(function(*arguments, self._clock.now_ns()))

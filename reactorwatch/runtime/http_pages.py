@@ -16,13 +16,19 @@ and names that origin in the `Host` header (RFC 9110, section 7.2). A connection
 closed, so that half-open ones do not add up.
 """
 
+import re
+import socket
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from threading import Event, Thread
+from functools import cache
+from ipaddress import ip_address
+from socketserver import BaseRequestHandler, ThreadingTCPServer
+from threading import Event, Thread, Timer
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, TypeAlias
+from wsgiref.simple_server import WSGIRequestHandler, WSGIServer
 
 import structlog
 
@@ -35,14 +41,6 @@ from reactorwatch.runtime.event_loop import retry
 
 if TYPE_CHECKING:
     from prometheus_client import Metric
-import contextlib
-import re
-import socket
-import threading
-from functools import cache
-from ipaddress import ip_address
-from socketserver import BaseRequestHandler, ThreadingTCPServer
-from wsgiref.simple_server import WSGIRequestHandler, WSGIServer
 
 log = structlog.get_logger()
 
@@ -246,10 +244,10 @@ def serve_metrics(config: MetricsConfig, metrics: Metrics) -> Iterator[Metrics |
         server_thread.join()
 
 
-REQUEST_TIMEOUT_S = 10.0
+REQUEST_TIMEOUT_S = 10.0  # so that half-open connections do not add up
 MAX_HEAD = 1 << 16
 """Bytes of the head of a request; http.client has the same limit for a line."""
-BLOCK = 1 << 16
+BLOCK = 1 << 16  # bytes that are passed on at once
 PRIVATE = ("local", "localhost", "internal", "lan", "home.arpa")
 """Ends of names that only a local network resolves (RFC 6761, 6762, 8375; ICANN reserved `internal` in 2024)."""
 STATUS = "421 Misdirected Request"
@@ -265,7 +263,7 @@ def is_own_host(header: str) -> bool:
     [True, True, True, True, False]
     """
     name = _PORT.sub("", header).rstrip(".").lower()
-    with contextlib.suppress(ValueError):
+    with suppress(ValueError):
         return bool(ip_address(name.strip("[]")))
     is_private = "." not in name or name.endswith(tuple(f".{end}" for end in PRIVATE))
     return bool(name) and (is_private or name in _own_names())
@@ -305,12 +303,12 @@ class _Connection(BaseRequestHandler):
         if not is_own_host(host):
             text = f"{REFUSAL % ascii(host)}\n"
             answer = f"HTTP/1.1 {STATUS}\r\nContent-Length: {len(text)}\r\nConnection: close\r\n\r\n{text}"
-            with contextlib.suppress(OSError):  # the other side has gone
+            with suppress(OSError):  # the other side has gone
                 self.request.sendall(answer.encode())
             return
-        with contextlib.suppress(OSError), socket.create_connection((LOOPBACK, self.server.target)) as page:
+        with suppress(OSError), socket.create_connection((LOOPBACK, self.server.target)) as page:
             page.sendall(head)
-            backwards = threading.Thread(target=_pass_on, args=(page, self.request), daemon=True)
+            backwards = Thread(target=_pass_on, args=(page, self.request), daemon=True)
             backwards.start()
             _pass_on(self.request, page)
             backwards.join()
@@ -326,10 +324,10 @@ class _Server(ThreadingTCPServer):
         self.address_family = socket.AF_INET6 if ":" in address[0] else socket.AF_INET
         super().__init__(address, handler)
 
-    @contextlib.contextmanager
+    @contextmanager
     def serving(self) -> Iterator[None]:
         """Serve while the context lasts."""
-        thread = threading.Thread(target=self.serve_forever, name="pages", daemon=True)
+        thread = Thread(target=self.serve_forever, name="pages", daemon=True)
         thread.start()
         try:
             yield
@@ -344,7 +342,7 @@ class _PageHandler(WSGIRequestHandler):
 
     def setup(self) -> None:
         """See `BaseRequestHandler`."""
-        self._overdue = threading.Timer(REQUEST_TIMEOUT_S, _close, (self.request,))
+        self._overdue = Timer(REQUEST_TIMEOUT_S, _close, (self.request,))
         self._overdue.start()
         super().setup()
 
@@ -388,7 +386,7 @@ class GuardedPort(_Server):
 
 def _read_head(connection: socket.socket) -> bytes:
     """The head of a request, and what came with it; cut where it is too long, or not complete in time."""
-    overdue = threading.Timer(REQUEST_TIMEOUT_S, _close, (connection,))
+    overdue = Timer(REQUEST_TIMEOUT_S, _close, (connection,))
     overdue.start()
     head = b""
     try:
@@ -403,13 +401,13 @@ def _read_head(connection: socket.socket) -> bytes:
 
 def _close(connection: socket.socket) -> None:
     """End a connection in both directions, also for a thread that waits for it."""
-    with contextlib.suppress(OSError):  # it has ended
+    with suppress(OSError):  # it has ended
         connection.shutdown(socket.SHUT_RDWR)
 
 
 def _pass_on(source: socket.socket, sink: socket.socket) -> None:
     """Pass all bytes on until one side ends, and then end the other."""
-    with contextlib.suppress(OSError):
+    with suppress(OSError):
         while data := source.recv(BLOCK):
             sink.sendall(data)
     _close(sink)

@@ -129,8 +129,6 @@ def in_job_order(outcomes: Iterator[tuple[int, Result | Failed]]) -> Iterator[Re
 THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 """Environment variables that libraries of linear algebra read when they are loaded."""
 
-END_WITHIN_S = 5.0
-
 _SPAWN = get_context("spawn")
 
 
@@ -235,7 +233,7 @@ def _start(work: Callable[[Any], Any]) -> _Worker:
 
 def _end(worker: _Worker) -> None:
     worker.pipe.close()
-    worker.process.join(END_WITHIN_S)
+    worker.process.join(5.0)
     if worker.process.is_alive():
         worker.process.kill()
         worker.process.join()
@@ -303,10 +301,8 @@ def choose_executor(processes: int | None = None, scheduler: str | None = None) 
     return SerialExecutor() if processes == 1 else ProcessExecutor(processes)
 
 
-CONNECT_WITHIN_S = 10.0
+CONNECT_WITHIN_S = 10.0  # a wrong address is reported while its user waits
 WORKERS_WITHIN_S = 60.0  # a worker on a busy machine takes half a minute to start
-
-ASK_AGAIN_S = 0.2
 
 
 class DaskExecutor:
@@ -393,7 +389,7 @@ def _check_workers(client: Any, address: str) -> None:
         # A worker that died meanwhile costs a retry of its jobs; if all did, others are starting.
         versions = {worker: version for worker, version in replies.items() if not isinstance(version, OSError)}
         if not versions:
-            time.sleep(ASK_AGAIN_S)  # the scheduler still lists dead workers
+            time.sleep(0.2)  # the scheduler still lists dead workers
     for worker, version in versions.items():
         if isinstance(version, Exception):
             raise version

@@ -168,8 +168,6 @@ _NAMES = "EACCES EDQUOT EFBIG EIO EISDIR ELOOP EMFILE ENAMETOOLONG ENFILE ENOSPC
 _SYSTEM_ERRORS = frozenset(getattr(errno, name) for name in _NAMES.split(" "))
 """Errors of a file or a disk, not of this software."""
 
-_MAX_REASON = 200
-
 
 def guard(name: str, run: Callable[[], int]) -> int:
     """Run a program to its end.
@@ -219,8 +217,8 @@ def report_crash(error: BaseException) -> str:
         A line for people: the error, and the path of the report or, if none can be written, the line of the code.
     """
     reason = " ".join(describe_exception(error).split())
-    if len(reason) > _MAX_REASON:
-        reason = f"{reason[:_MAX_REASON]}…"
+    if len(reason) > 200:
+        reason = f"{reason[:200]}…"
     path = _write(_report(error))
     if path is not None:
         where = f"please send {path}, which says where, and the files that it names"

@@ -43,12 +43,8 @@ ROUTER_SETTINGS, SETTINGS = "router.json5", "settings.toml"
 REGISTER_FILE = "site.json"
 FILES = (CA, CERTIFICATE, KEY, ROUTER_SETTINGS, SETTINGS, REGISTER_FILE)
 DEFAULT_ENDPOINT = "tls/127.0.0.1:7447"
-AUTHORITY_DAYS = 3650.0
 
-MAX_DAYS = 3650.0
-MAX_COMMON_NAME = 64
-"""Letters of a certificate's common name (RFC 5280, ub-common-name)."""
-MAX_PLANT_NAME = MAX_COMMON_NAME - max(len(common_name("", role.name)) for role in ROLES) - 2 * SERIAL_BYTES - 1
+MAX_PLANT_NAME = 64 - max(len(common_name("", role.name)) for role in ROLES) - 2 * SERIAL_BYTES - 1
 
 
 class Register(msgspec.Struct, forbid_unknown_fields=True):
@@ -180,10 +176,10 @@ def _check(plants: tuple[str, ...], days: float) -> None:
         if len(plant) > MAX_PLANT_NAME:
             raise InputError(
                 f"--plant {plant}: a plant of a site has at most {MAX_PLANT_NAME} letters, because certificates hold "
-                f"{MAX_COMMON_NAME}, got {len(plant)}"
+                f"64, got {len(plant)}"
             )
-    if not 1.0 <= days <= MAX_DAYS:
-        raise InputError(f"--days must be in [1, {MAX_DAYS:g}], got {days:g}")
+    if not 1.0 <= days <= 3650.0:
+        raise InputError(f"--days must be in [1, 3650], got {days:g}")
 
 
 def _check_paths(folder: Path, holders: list[str]) -> None:
@@ -244,7 +240,7 @@ def _load_authority(folder: Path, now: datetime.datetime, *, is_old: bool) -> tu
     """Load the authority of a site, or make that of a new site; returns it with the folders made."""
     if (folder / CA).exists() or is_old:
         return Identity(read_certificate(folder / CA), read_key(folder / KEY)), []
-    ca = make_authority(f"reactorwatch {now:%Y-%m-%d}", now, AUTHORITY_DAYS)
+    ca = make_authority(f"reactorwatch {now:%Y-%m-%d}", now, 3650.0)
     _install(folder, lambda new: ca.write(new / CA, new / KEY))
     return ca, [folder]
 

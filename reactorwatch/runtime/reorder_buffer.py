@@ -32,10 +32,10 @@ from reactorwatch.runtime.gap_tracker import GapTracker
 
 Item = TypeVar("Item")
 
-TIMEOUT_NS = 5_000_000_000
+TIMEOUT_NS = 5_000_000_000  # of a stream whose keys have all gone on: what they passed is lost
 RECOVERY_TIMEOUT_NS = 15_000_000_000
 """Zenoh gives a query up after 10 s; then it releases what it has."""
-POLL_NS = 250_000_000
+POLL_NS = 250_000_000  # within the timeout it makes no difference
 START_WINDOW_NS = 500_000_000
 MAX_STREAMS = 100_000
 """Largest number of stored streams. A restarted publisher is another stream, and so is each plant of a fleet."""

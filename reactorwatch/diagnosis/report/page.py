@@ -12,7 +12,13 @@ from reactorwatch import html
 from reactorwatch.diagnosis.difference import Difference
 from reactorwatch.diagnosis.report import mathml, panels
 from reactorwatch.diagnosis.report.equations import Equation, balances, meanings
-from reactorwatch.diagnosis.report.words import (
+from reactorwatch.diagnosis.result import AMBIGUOUS, NOMINAL, Cause, Diagnosis, Experiment
+from reactorwatch.diagnosis.whiteness import WHITE
+from reactorwatch.process import MODELS
+from reactorwatch.process.effect import Effect
+from reactorwatch.process.model import ProcessModel
+from reactorwatch.process.profiles import FREE_NAME, PROFILES
+from reactorwatch.sentences.diagnosis import (
     describe_causes,
     describe_difference,
     describe_location,
@@ -25,12 +31,6 @@ from reactorwatch.diagnosis.report.words import (
     format_interval,
     law_rows,
 )
-from reactorwatch.diagnosis.result import AMBIGUOUS, NOMINAL, Cause, Diagnosis, Experiment
-from reactorwatch.diagnosis.whiteness import WHITE
-from reactorwatch.process import MODELS
-from reactorwatch.process.effect import Effect
-from reactorwatch.process.model import ProcessModel
-from reactorwatch.process.profiles import FREE_NAME, PROFILES
 
 PRINTED = 80
 """Signs of an equation that fit on a line of A4 in 11 pt, as Chromium draws them."""

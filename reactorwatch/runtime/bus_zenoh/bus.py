@@ -37,23 +37,17 @@ from reactorwatch.runtime.reorder_buffer import Gap, ReorderBuffer
 
 log = structlog.get_logger()
 
-FLUSH_WITHIN_S = 10.0
-HEARTBEAT_S = 0.5
+HEARTBEAT_S = 0.5  # of a publisher, by which a subscriber notices that the last messages are missing
 PRIORITY = zenoh.Priority.DATA_HIGH
 """Above Zenoh's default, so that publishers that are no nodes do not fill the queues of a link."""
-LAST_RECOVERY_S = 1.0  # a bus stays open after its last message, so that it can be recovered
 MAX_INCIDENTS = 100
 """Incidents of a plant whose last message is cached: each is a key of its own, and a plant goes on for years."""
 MAX_NEW_KEYS, NEW_KEYS_PER_S = 1000, 100
 """Keys of uncached kinds that are declared at once, and in each second after that."""
-BATCH_PERIOD_S = 0.005
-LOG_INTERVAL_S = 60.0
-MAX_CHANNEL = 5 * MAX_BATCH
 
 LAST = "_max=1"
 """Selector of the last message that a publisher caches on each key."""
-HISTORY_WITHIN_S = 10.0
-MAX_TRANSIT_S = 5.0  # of a message; a missing one was published at most this long before its predecessor arrived
+HISTORY_WITHIN_S = 10.0  # in which Zenoh, too, gives a query up
 LAST_QUERY_PERIOD_S = 20.0
 """Period of queries for the last number on each key, on a bus with certificates.
 
@@ -161,14 +155,14 @@ class ZenohBus:
         """
         delivery = self._make_delivery(key_expression, handler, options.get("on_gap"))
         # The thread holds the channel alone: a subscriber in use cannot be undeclared.
-        channel = self._declare_subscriber(key_expression, zenoh.handlers.FifoChannel(MAX_CHANNEL)).handler
+        channel = self._declare_subscriber(key_expression, zenoh.handlers.FifoChannel(5 * MAX_BATCH)).handler
 
         def empty() -> None:
             reader = SampleReader()
             with contextlib.suppress(zenoh.ZError):  # it is closed
                 while True:
                     self._sort_out(read_batch(channel, reader), delivery, handler)
-                    time.sleep(BATCH_PERIOD_S)
+                    time.sleep(0.005)
 
         self._batch_threads.append(threading.Thread(target=empty, name="gather", daemon=True))
         self._batch_threads[-1].start()
@@ -298,7 +292,9 @@ class ZenohBus:
         messages = list[SequencedMessage]()
         try:
             for replies, _ in self._query_caches(
-                keys_of(stream), lambda waited_s: history_selector(since_s + waited_s + MAX_TRANSIT_S)
+                # a missing message was published at most 5 s before its predecessor arrived
+                keys_of(stream),
+                lambda waited_s: history_selector(since_s + waited_s + 5.0),
             ):
                 messages += replies
         except zenoh.ZError as error:  # the bus is being closed, for instance
@@ -338,7 +334,7 @@ class ZenohBus:
         """Count a message on many keys at once, which no node sends, and log it once a minute."""
         self._wildcards += 1
         now_s = time.monotonic()
-        if self._wildcard_logged_at is None or now_s - self._wildcard_logged_at >= LOG_INTERVAL_S:
+        if self._wildcard_logged_at is None or now_s - self._wildcard_logged_at >= 60.0:
             self._wildcard_logged_at = now_s
             log.warning("refused: a message must be on one key", key=key[:MAX_ENCODING], so_far=self._wildcards)
 
@@ -410,8 +406,8 @@ class ZenohBus:
         """
         self._closed.set()
         if self._published_at is not None:
-            time.sleep(max(0.0, self._published_at + LAST_RECOVERY_S - time.monotonic()))
-        for _ in self._voice.get(NO_QUERYABLE, timeout=FLUSH_WITHIN_S):
+            time.sleep(max(0.0, self._published_at + 1.0 - time.monotonic()))
+        for _ in self._voice.get(NO_QUERYABLE, timeout=10.0):
             pass
         # Advanced ones may outlive the session otherwise, and hang the process (eclipse-zenoh/zenoh-python#624).
         for declared in (
@@ -429,7 +425,7 @@ class ZenohBus:
         # A thread that is in Zenoh's code when the interpreter ends aborts the process: "exception not rethrown".
         for thread in self._batch_threads:
             if thread is not threading.current_thread():
-                thread.join(FLUSH_WITHIN_S)
+                thread.join(10.0)
 
 
 def _log_gap(gap: Gap) -> None:

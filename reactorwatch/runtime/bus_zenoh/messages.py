@@ -32,7 +32,6 @@ EVERY_ROW = frozenset({keys.SAMPLE, keys.ESTIMATE, keys.RECONSTRUCTION, keys.CHA
 RARE_CHARTS = frozenset({"parameters"})
 MAX_CACHED_OF_OTHERS = 600
 """Messages cached on each key of another kind: those of `history_s` at one a plant minute and `--speed 600`."""
-MAX_BATCH_BYTES = 1 << 20
 
 ReadSample: TypeAlias = tuple[tuple[int, int] | None, Encoded]
 """Publisher and number of a sample, if it has them, and its message."""
@@ -129,7 +128,7 @@ def cache_size(key: str, cache_messages: int) -> int:
 def read_batch(channel: Any, reader: SampleReader) -> list[ReadSample]:
     """Wait for a sample, and read it and those that have arrived until then."""
     sample, now_ns = channel.recv(), time.time_ns()
-    batch, room = list[ReadSample](), MAX_BATCH_BYTES
+    batch, room = list[ReadSample](), 1 << 20
     while sample is not None:
         read = reader.read(sample, now_ns)
         batch.append(read)

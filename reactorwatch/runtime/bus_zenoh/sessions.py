@@ -194,8 +194,6 @@ def _validate(settings: dict[str, Any], endpoint: str) -> zenoh.Config:
 LARGE_BYTES = 4 << 20
 """Four times the largest payload that a node reads: normal operation has no such blocks."""
 
-_M_MMAP_THRESHOLD = -3  # malloc.h
-
 
 def release_large_blocks() -> bool:
     """Keep the threshold of the C library's heap at `LARGE_BYTES`; False without such a heap.
@@ -206,10 +204,11 @@ def release_large_blocks() -> bool:
     quarter of an hour grew by 35 MB from its sixth minute to its last, of which it used 2 MB.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
-    return mallopt is not None and mallopt(_M_MMAP_THRESHOLD, LARGE_BYTES) == 1
+    # M_MMAP_THRESHOLD of malloc.h
+    return mallopt is not None and mallopt(-3, LARGE_BYTES) == 1
 
 
-LOG_EVERY_NS = 1_000_000_000
+LOG_EVERY_NS = 1_000_000_000  # a line of the log a second, however many messages are refused
 DECISIONS = "error,zenoh::net::routing::interceptor::access_control=trace"
 _COLOUR = re.compile(rb"\x1b\[[0-9;]*m")
 _DECISION = re.compile(b"routing::interceptor::access_control")
@@ -222,9 +221,6 @@ _VERDICT = re.compile(
 )
 """Decision on a message, or on one that may come, of a session; a decision that was kept lacks the holder's name.
 Declarations and deletions are left out: a client that disconnects undeclares its keys, which looks like a Delete."""
-_LONGEST = 200
-MAX_SESSIONS = 10_000
-"""Sessions whose names are kept; those of the oldest are dropped first."""
 
 
 class RefusalLog:
@@ -255,7 +251,7 @@ class RefusalLog:
         if verdict is not None and self._is_of_message(verdict) and verdict["is_refused"]:
             name = self._names.get(verdict["session"], verdict["session"])
             parts = (verdict["what"], name, verdict["key"])
-            what, who, key = (ascii(part.decode(errors="replace"))[1:-1][:_LONGEST] for part in parts)
+            what, who, key = (ascii(part.decode(errors="replace"))[1:-1][:200] for part in parts)
             self._text = f"refused: {what} by {who} on {key}"
             self._since, self._total = self._since + 1, self._total + 1
         return _DECISION.search(line) is not None or verdict is not None
@@ -264,7 +260,7 @@ class RefusalLog:
         """True for a decision on a message that came; False for one in advance."""
         if verdict["name"] is not None:
             self._names[verdict["session"]] = verdict["name"]
-            if len(self._names) > MAX_SESSIONS:
+            if len(self._names) > 10_000:
                 del self._names[next(iter(self._names))]
         key, kinds = self._declared.get(verdict["thread"], (b"", set()))
         if not verdict["cached"] and verdict["key"] == key and verdict["what"] not in kinds:

@@ -225,7 +225,7 @@ def test_a_recording_of_a_plant_with_an_impossible_name_is_watched_under_no_name
     "fails",
     [
         "reactorwatch.diagnosis.report.page.as_page",
-        "reactorwatch.cli.diagnose.report_object",
+        "reactorwatch.api.diagnosis.DiagnosisResult.to_dict",
         "reactorwatch.cli.diagnose.write_extended_model",
         "reactorwatch.cli.diagnose.write_drawing",
     ],

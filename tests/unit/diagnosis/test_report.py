@@ -9,6 +9,7 @@ from html.parser import HTMLParser
 import casadi as ca
 import numpy as np
 import pytest
+from msgspec import structs
 
 from reactorwatch.diagnosis.report import mathml
 from reactorwatch.diagnosis.report.equations import balances
@@ -113,7 +114,7 @@ def test_an_ambiguous_verdict_shows_all_rivals_with_their_sizes_and_the_experime
 
 
 def test_an_ambiguous_verdict_without_an_experiment_states_it() -> None:
-    text = as_page(replace(CASES["ambiguous"], experiment=None), cstr(), EFFECTS, "a.csv", "extended.json")
+    text = as_page(structs.replace(CASES["ambiguous"], experiment=None), cstr(), EFFECTS, "a.csv", "extended.json")
     assert "No experiment within the limits separates them." in text.partition("<h2>")[0]
 
 
@@ -135,7 +136,7 @@ def test_something_unknown_is_drawn_over_time_as_what_would_do_the_same() -> Non
     told = replace(
         curves, unknown=UnknownInputCurve("heat loss", "1/min", np.linspace(0.0, 0.01, curves.time_min.size))
     )
-    text = as_page(replace(CASES["unknown"], curves=told), cstr(), EFFECTS, "a.csv", "extended.json")
+    text = as_page(structs.replace(CASES["unknown"], curves=told), cstr(), EFFECTS, "a.csv", "extended.json")
     assert "Size of the unknown effect" in text
     assert "Estimated as the size of: heat loss, 1/min" in text
 
@@ -153,7 +154,7 @@ def test_the_page_lists_the_posterior_of_uncertain_parameters() -> None:
 
 def test_a_page_without_curves_is_refused() -> None:
     with pytest.raises(ValueError, match="without its curves"):
-        as_page(replace(CASES["named"], curves=None), cstr(), EFFECTS, "a.csv", "extended.json")
+        as_page(structs.replace(CASES["named"], curves=None), cstr(), EFFECTS, "a.csv", "extended.json")
 
 
 def test_a_free_run_that_ran_away_and_a_size_of_unknown_spread_are_drawn_as_far_as_they_go() -> None:
@@ -168,7 +169,7 @@ def test_a_free_run_that_ran_away_and_a_size_of_unknown_spread_are_drawn_as_far_
         replace(curves, residual_before={"C": nothing, "T": nothing}),
         replace(curves, measured={"C": nothing, "T": curves.measured["T"]}),
     ):
-        text = as_page(replace(CASES["named"], curves=broken), cstr(), EFFECTS, "a.csv", "extended.json")
+        text = as_page(structs.replace(CASES["named"], curves=broken), cstr(), EFFECTS, "a.csv", "extended.json")
         drawn = re.findall(r'\b(?:d|points)="([^"]*)"', text)
         assert not [part for part in drawn if "nan" in part or "inf" in part]
 

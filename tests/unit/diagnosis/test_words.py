@@ -6,13 +6,11 @@ import re
 import msgspec
 import pytest
 
-from reactorwatch.diagnosis.report.machine import as_object, report_object
-from reactorwatch.diagnosis.report.plain import as_text
-from reactorwatch.diagnosis.report.words import describe_size, describe_verdict, format_interval
 from reactorwatch.diagnosis.result import Cause, Diagnosis, Estimate
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.library.cascaded_tanks import EFFECTS as TANK_EFFECTS
 from reactorwatch.process.library.cstr import EFFECTS
+from reactorwatch.sentences.diagnosis import describe_size, describe_verdict, diagnosis_text, format_interval
 from tests.unit.diagnosis.cases import ADJUSTED, CASES, ROWS
 
 
@@ -68,7 +66,13 @@ def test_the_size_of_every_cause_is_stated_with_its_unit_and_meaning(effect: Eff
     for sign in (1.0, -1.0) if effect.lower < 0.0 else (1.0,):
         size = Estimate(sign * abs(effect.typical), 0.01 * abs(effect.typical), effect.unit)
         constants = {item.name: Estimate(item.value, item.sd, item.unit) for item in effect.constants}
-        cause = Cause(effect.name, profile, effect.label, effect.location, {"size": size} | constants)
+        cause = Cause(
+            cause=effect.name,
+            profile=profile,
+            label=effect.label,
+            location=effect.location,
+            parameters={"size": size} | constants,
+        )
         said = describe_size(cause, (effect,))
         unit = "%" if "%" in effect.larger else effect.unit
         value = abs(size.value) * (100.0 if unit == "%" else 1.0)
@@ -93,7 +97,7 @@ def test_more_and_less_have_different_words() -> None:
 
 
 def test_people_read_sizes_onsets_rivals_experiment_gain_and_remarks() -> None:
-    text = as_text(CASES["ambiguous"], "run.csv", EFFECTS)
+    text = diagnosis_text(CASES["ambiguous"], EFFECTS)
     for part in (
         "run.csv: 2000 rows over 199.9 min",
         "either      coolant leak (coolant_flow, step): 4.996 % of the coolant lost (± 0.017 %), "
@@ -107,18 +111,17 @@ def test_people_read_sizes_onsets_rivals_experiment_gain_and_remarks() -> None:
         assert part in text
     order = [text.index(part) for part in ("either", "  or  ", "experiment  ", "evidence  ", "held out  ")]
     assert order == sorted(order)
-    assert "size        4.996 % of the coolant lost (± 0.017 %)  (95 %)" in as_text(CASES["named"], "run.csv", EFFECTS)
-    assert "note        The record runs under <control>." in as_text(CASES["pair"], "run.csv", EFFECTS)
+    assert "size        4.996 % of the coolant lost (± 0.017 %)  (95 %)" in diagnosis_text(CASES["named"], EFFECTS)
+    assert "note        The record runs under <control>." in diagnosis_text(CASES["pair"], EFFECTS)
 
 
 @pytest.mark.parametrize("case", CASES)
 def test_the_object_has_the_keys_that_are_promised_and_nothing_else(case: str) -> None:
-    said = json.loads(msgspec.json.encode(as_object(CASES[case], "run.csv", 1.23456)))
+    said = json.loads(msgspec.json.encode(CASES[case].to_dict()))
     assert list(said) == [
         "file", "zero", "samples", "runs", "span_min", "seconds", "verdict", "causes", "alternatives", "location",
         "locations", "law", "significant", "practical", "gain", "adequacy", "experiment", "extended_model",
     ]  # fmt: skip
-    assert said["seconds"] == 1.235
     for item in said["gain"]["held_out"].values():
         assert list(item) == ["rmse_before", "rmse_after", "noise_sd", "unit"]
     for cause in [*said["causes"], *(cause for item in said["alternatives"] for cause in item["causes"])]:
@@ -128,19 +131,19 @@ def test_the_object_has_the_keys_that_are_promised_and_nothing_else(case: str) -
 
 
 def test_a_law_has_its_intervals_its_rivals_and_its_range() -> None:
-    law = as_object(CASES["law"], "run.csv", 1.0)["law"]
+    law = CASES["law"].to_dict()["law"]
     assert (law["location"], law["form"], law["formula"]) == ("energy_balance", "power", "a (T/440)^n")
     assert law["parameters"]["n"] == {"value": 4.1, "sd": 0.2, "unit": "1"}
     assert law["rivals"] == [{"location": "coolant", "form": "linear", "formula": "a + b (qc - 100)", "delta_bic": 4.5}]
     assert law["range"] == {"T": [425.0, 452.0]}
     assert law["held_out"]["T"]["rmse_after"] == 0.301
-    text = as_text(CASES["law"], "run.csv", EFFECTS)
+    text = diagnosis_text(CASES["law"], EFFECTS)
     for part in ("a (T/440)^n", "4.1 ± 0.4", "425 to 452", "worse by 4.5 in BIC", "correlation 0.97 with Tf"):
         assert part in text
 
 
 def test_the_object_holds_what_was_found() -> None:
-    said = as_object(CASES["ambiguous"], "run.csv", 1.0)
+    said = CASES["ambiguous"].to_dict()
     assert said["causes"][0]["parameters"]["onset"] == {"value": 150.3349, "sd": 0.0122, "unit": "min"}
     (alternative,) = said["alternatives"]
     assert alternative["delta_bic"] == 3.21
@@ -169,22 +172,22 @@ def test_an_uncertain_parameter_is_reported_with_its_posterior() -> None:
         "The simulation is right within what was stated of its parameters: K3 is a little off, "
         "and the rest of the record is noise."
     )
-    assert "parameter   K3 711 ± 3 l/min; stated: 700 ± 30 l/min  (95 %)" in as_text(ADJUSTED, "run.csv", EFFECTS)
-    said = as_object(ADJUSTED, "run.csv", 1.0)["parameters"]
+    assert "parameter   K3 711 ± 3 l/min; stated: 700 ± 30 l/min  (95 %)" in diagnosis_text(ADJUSTED, EFFECTS)
+    said = ADJUSTED.to_dict()["parameters"]
     assert list(said) == ["K3", "Tf"]
     assert said["K3"] == {"nominal": 700.0, "stated_sd": 14.0, "value": 711.2, "sd": 1.5, "unit": "l/min"}
 
 
 def test_what_is_no_finite_number_is_null() -> None:
     case: Diagnosis = CASES["ambiguous"]
-    assert as_object(case, "run.csv", 1.0)["gain"]["held_out"]["T"]["rmse_before"] is None
-    assert as_object(CASES["nominal"], "run.csv", 1.0)["location"] is None
+    assert case.to_dict()["gain"]["held_out"]["T"]["rmse_before"] is None
+    assert CASES["nominal"].to_dict()["location"] is None
 
 
 @pytest.mark.parametrize("case", CASES)
 def test_the_report_for_machines_adds_where_the_simulation_differs(case: str) -> None:
-    said = json.loads(msgspec.json.encode(report_object(CASES[case], "run.csv", 1.0)))
-    assert said.keys() - as_object(CASES[case], "run.csv", 1.0).keys() == {"differences"}
+    said = json.loads(msgspec.json.encode(CASES[case].to_dict("differences")))
+    assert said.keys() - CASES[case].to_dict().keys() == {"differences"}
     for name, item in said["differences"].items():
         assert item["unit"] == CASES[case].gain.held_out[name].unit
         assert sum(part["rows"] for part in item["along"]["time"]) == ROWS

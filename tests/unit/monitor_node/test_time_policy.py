@@ -133,55 +133,6 @@ def test_without_any_disturbance_only_the_leak_is_alarmed(undisturbed: RunOutput
 # --- doubled, late, out of order -----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("rows_later", [0, 7])
-def test_a_sample_that_comes_twice_changes_nothing(leaking: Run, undisturbed: RunOutput, rows_later: int) -> None:
-    messages = leaking.messages()
-    doubled: list[Encoded] = []
-    for index, message in enumerate(messages):
-        doubled.append(message)
-        if index % 5 == 0 and index >= 3 * rows_later:
-            doubled.append(messages[index - 3 * rows_later])
-    output = watched(doubled)
-    assert output.published == undisturbed.published
-    assert output.health.duplicated == len(doubled) - len(messages)
-    assert output.health.late == output.health.lost == 0
-
-
-def test_a_sample_that_comes_after_its_row_was_given_up_changes_nothing_but_the_count(leaking: Run) -> None:
-    def held_back(row: int, signal: str) -> bool:
-        return row % 40 == 5 and signal == "T"
-
-    never = leaking.messages(held_back)
-    tardy: list[Encoded] = []
-    for number, time_min, values in leaking.rows:
-        if number >= 20 and held_back(number - 20, "T"):
-            tardy.append(sample("T", number - 20, time_min - 2.0, leaking.rows[number - 20][2][2]))
-        tardy += [
-            sample(signal, number, time_min, value)
-            for signal, value in zip(SIGNALS, values, strict=True)
-            if not held_back(number, signal)
-        ]
-    without, output = watched(never), watched(tardy)
-    assert output.published == without.published
-    assert without.health.late == 0
-    assert output.health.late == len(tardy) - len(never)
-    assert output.health.late > 20
-    assert output.health.incomplete_rows == without.health.incomplete_rows
-
-
-def test_samples_out_of_order_by_a_few_rows_change_nothing_but_the_count(leaking: Run, undisturbed: RunOutput) -> None:
-    messages, order = leaking.messages(), random.Random(5)
-    shuffled = messages[:3]
-    for start in range(3, len(messages), 12):
-        part = messages[start : start + 12]
-        order.shuffle(part)
-        shuffled += part
-    output = watched(shuffled)
-    assert output.published == undisturbed.published
-    assert output.health.out_of_order > 0
-    assert output.health.late == output.health.lost == 0
-
-
 # --- missing -------------------------------------------------------------------------------------------------
 
 

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from monitor_node.config import MonitorConfig
 from monitor_node.node import MonitorNode
-from monitor_node.storage.state_files import StateStore
+from monitor_node.state_files import StateStore
 from reactorwatch.contract.codec import Encoded, decode
 from reactorwatch.contract.messages_pb2 import Health
 from reactorwatch.errors import InputError, UnavailableError, is_passing

@@ -14,7 +14,7 @@ from monitor_node.causes.stage import START_STEPS, START_STEPS_A_ROW, Reconstruc
 from monitor_node.causes.window import Row
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
-from monitor_node.learn.signal_range import signal_ranges
+from monitor_node.watched_process import signal_ranges
 from reactorwatch.contract.codec import Encoded
 from reactorwatch.contract.messages_pb2 import Alarm, Incident, Sample
 from reactorwatch.kalman.batch import BudgetExceededError, StepBudget, StepCost

@@ -6,11 +6,10 @@ import pytest
 
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
-from monitor_node.learn.signal_range import SignalRange
 from monitor_node.replay import backtest
 from monitor_node.replay.verification import verify
 from monitor_node.watch.operation import Operation
-from monitor_node.watched_process import signal_settings
+from monitor_node.watched_process import SignalRange, signal_settings
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication, encode
 from reactorwatch.contract.messages_pb2 import Alarm, Estimate, Quality, Sample
