@@ -31,8 +31,9 @@ from reactorwatch.records.write import write_table
 from reactorwatch.results.backtest import Backtest
 from reactorwatch.spc.charts.base import format_quantity
 from recorder.columns import read_run
+from recorder.files.recording import Recording
 from recorder.panels.signals import OVERVIEW, find_model, signal_title
-from recorder.panels.signals import OVERVIEW, find_model, signal_title
+from recorder.tools.convert import import_csv, read_record
 from recorder.tools.player import samples_of
 from tests.tables import UNITS, read_csv
 from tests.unit.diagnosis.runs import record_of
