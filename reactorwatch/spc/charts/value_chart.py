@@ -171,8 +171,7 @@ def average_rows(residuals: Array, weight: float) -> Array:
     """
     averages, average = np.empty_like(residuals), np.zeros(residuals.shape[1])
     for row, residual in enumerate(residuals):
-        average = average + weight * (residual - average)
-        averages[row] = average
+        averages[row] = average = average + weight * (residual - average)
     return averages[min(int(2.0 / weight), len(averages) // 2) :]
 
 
@@ -294,8 +293,7 @@ class StatisticsChart(ValueChart):
     @classmethod
     def edges(cls, baseline: ValueBaseline) -> list[int]:
         """First row of each piece of the training, and the number of its rows; see `pieces`."""
-        edges: list[int] = np.linspace(0, len(baseline.values), BLOCKS * cls.pieces + 1).astype(int).tolist()
-        return edges
+        return list(map(int, np.linspace(0, len(baseline.values), BLOCKS * cls.pieces + 1)))
 
     @classmethod
     def shrinkage(cls, model: Model, held_out: int, rows: int) -> float:
@@ -319,8 +317,7 @@ class StatisticsChart(ValueChart):
         """Averages of the training's statistics, each row judged by the model of the other blocks."""
         roots, weight = cls.held_out_roots(baseline), baseline.settings[cls.weight_key]
         learned = [learn(column, 1e-12) for column in roots.T]
-        variances = [(item.sd / item.shift_gain) ** 2 / item.rows for item in learned]
-        sds = [sqrt(average_variance(item, weight) + v) for item, v in zip(learned, variances, strict=True)]
+        sds = [sqrt(average_variance(item, weight) + (item.sd / item.shift_gain) ** 2 / item.rows) for item in learned]
         freedom = min(degrees_of_freedom(item, weight) for item in learned)
         found = Averages.of(roots, weight, np.array(sds), freedom)
         if not cls.is_skewed:
