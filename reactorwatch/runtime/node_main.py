@@ -139,7 +139,7 @@ def configure_log(level: int = 20, *, as_json: bool = False) -> None:
     import structlog  # only here: with asyncio and rich it is half of the start of `--help`
     from structlog.tracebacks import ExceptionDictTransformer
 
-    form: "list[Processor]" = [
+    form: list[Processor] = [
         structlog.processors.TimeStamper(fmt="%H:%M:%S", utc=False),
         _escape,
         structlog.dev.ConsoleRenderer(colors=sys.stderr.isatty(), pad_event_to=0),
