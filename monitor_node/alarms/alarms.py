@@ -357,4 +357,4 @@ class KpiCounter(Memory):
 
     def _chatters(self, alarm: str) -> bool:
         times = [item.time_ns for item in self.recent if item.alarm == alarm]
-        return any(last - first <= CHATTER_WITHIN_NS for first, last in zip(times, times[3 - 1 :], strict=False))
+        return any(last - first <= CHATTER_WITHIN_NS for first, last in zip(times, times[2:], strict=False))
