@@ -21,6 +21,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from benchmarks.harness.plants import draw_bad_value
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from monitor_node.fleet import ANY, FleetMonitor, PlantKind
@@ -241,10 +242,8 @@ def _bad_values(draw: random.Random, count: int) -> tuple[list[float], list[int]
     while len(values) < count:
         signal, rows = draw.randrange(len(signals)), draw.randrange(1, LONGEST_RUN + 1)
         lower, upper, _ = signal_ranges(cstr(), signals)[signal]
-        far = draw.choice((-1, 1)) * 10.0 ** draw.uniform(-3.0, 14.9)
-        value = draw.choice((draw.uniform(lower, upper), lower, upper, far, -999.0, 65535.0))
-        spread = draw.choice((0.0, 1e-3, 0.1)) * (upper - lower)
-        values += [value + spread * draw.random() for _ in range(rows)]
+        value = draw_bad_value(draw, lower, upper)
+        values += [value() for _ in range(rows)]
         places += [3 * (row + at) + signal for at in range(rows)]
         row += rows + draw.randrange(1, 100)
     return values, places

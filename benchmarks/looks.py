@@ -18,6 +18,7 @@ from collections.abc import Iterable, Sequence
 from statistics import median
 from typing import NamedTuple
 
+from benchmarks.harness.plants import draw_bad_value
 from monitor_node.alarms.alarms import SuspectedCause
 from monitor_node.causes.isolation import LOOK_STEPS, LOOK_STEPS_A_ROW, Isolation
 from monitor_node.causes.stage import FEW_ROWS, LOOKS, ROWS_BEFORE, preparation
@@ -117,11 +118,9 @@ def _bad_values(draw: random.Random) -> dict[tuple[str, int], float]:
     for _ in range(draw.choice((1, 1, 2))):
         place = draw.randrange(len(SIGNALS))
         lower, upper, _ = signal_ranges(cstr(), SIGNALS)[place]
-        far = draw.choice((-1.0, 1.0)) * 10.0 ** draw.uniform(-3.0, 14.9)
-        value = draw.choice((draw.uniform(lower, upper), lower, upper, far, -999.0, 9999.0, 65535.0))
-        spread = draw.choice((0.0, 0.0, 1e-3, 0.1)) * (upper - lower)
+        value = draw_bad_value(draw, lower, upper)
         first, rows = draw.randrange(20), draw.randrange(1, 51)
-        bad |= {(SIGNALS[place], row): value + spread * draw.random() for row in range(first, first + rows)}
+        bad |= {(SIGNALS[place], row): value() for row in range(first, first + rows)}
     return bad
 
 

@@ -23,8 +23,7 @@ import numpy as np
 from benchmarks.faults.detectors import newest_suspects, watch
 from benchmarks.harness.bank import AFTER_MIN, BANK, Case, cases, record_of
 from benchmarks.harness.plants import messages_of
-from benchmarks.harness.pool import Pool
-from benchmarks.harness.tables import share_interval
+from benchmarks.harness.study import Pool, share_interval
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from monitor_node.diagnosis_worker import find_deviations

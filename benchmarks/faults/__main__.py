@@ -3,7 +3,7 @@
 Every fault of the bank (`benchmarks/harness/bank.py`) in three sizes and for many seeds: 100 minutes of training, 200
 without a fault, then the fault for 150. All detectors watch the same records at the same promised rate of false alarms:
 
-- the oracle, which knows the fault (`benchmarks/faults/oracle.py`): no detector can be much faster;
+- the oracle, which knows the fault (`benchmarks/faults/study.py`): no detector can be much faster;
 - the monitor, as it is configured by default;
 - the report's method (`benchmarks/faults/detectors.py`), with limits widened to that rate, and at its own 3 sigma.
 
@@ -44,8 +44,7 @@ from benchmarks.faults.study import (
     total,
 )
 from benchmarks.harness.bank import AFTER_MIN, BANK, GRADES, PERIOD_MIN, cases
-from benchmarks.harness.pool import Pool, add_options
-from benchmarks.harness.tables import stamp
+from benchmarks.harness.study import Pool, add_options, stamp
 
 
 def quantiles(delays_min: Sequence[float]) -> tuple[float, float]:

@@ -12,8 +12,7 @@ import numpy as np
 
 import reactorwatch as rw
 from benchmarks.harness.plants import FLOWS, INPUTS, KINDS, NOISE_SD, simulate
-from benchmarks.harness.pool import Pool, add_options
-from benchmarks.harness.tables import head, line, median_interval, poisson_interval, share_interval
+from benchmarks.harness.study import Pool, add_options, head, line, median_interval, poisson_interval, share_interval
 from benchmarks.promise import black_box, statements
 
 SEED, SEED_STEP = 100, 1000

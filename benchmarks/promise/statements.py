@@ -9,8 +9,7 @@ from scipy import special
 from scipy.signal import lfilter
 
 from benchmarks.harness.plants import messages_of
-from benchmarks.harness.pool import Pool
-from benchmarks.harness.tables import head, line, percent, share_interval
+from benchmarks.harness.study import Pool, head, line, percent, share_interval
 from monitor_node.config import MonitorConfig
 from monitor_node.replay import backtest
 from plant_node.config import PlantConfig

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from benchmarks.harness.pool import Pool
+from benchmarks.harness.study import Pool
 
 if TYPE_CHECKING:
     from benchmarks.study_figures.study import Figure, Finding

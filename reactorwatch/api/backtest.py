@@ -2,20 +2,17 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from monitor_node.replay.backtest import RecordFacts, check_training_record, check_watched, run
 from monitor_node.watched_process import WatchedProcess, limit_training, watch_process
 from reactorwatch import html
 from reactorwatch.api.monitor import monitor_settings
-from reactorwatch.api.page import write_page
-from reactorwatch.api.record_view import signal_panels
-from reactorwatch.api.records import ProcessLike
-from reactorwatch.api.shown import Shown
+from reactorwatch.api.records import ProcessLike, signal_panels
+from reactorwatch.api.shown import Shown, page_of
 from reactorwatch.contract.codec import encode
 from reactorwatch.description.read import find_process
-from reactorwatch.figures import Mark, Panel, draw
+from reactorwatch.figures import Mark, Panel
 from reactorwatch.optional import frame_of_rows
 from reactorwatch.records.record import Record
 from reactorwatch.results.alarms import RaisedAlarm
@@ -24,7 +21,6 @@ from reactorwatch.sentences.backtest import backtest_headline, backtest_text
 from recorder.tools.player import samples_of
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
     from pandas import DataFrame
 
 COLUMNS = ("alarm", "priority", "raised_min", "cleared_min", "signals", "cause", "probability")
@@ -76,14 +72,6 @@ class BacktestResult(Shown[Backtest]):
         """
         return frame_of_rows([_row(alarm) for alarm in self.alarms], COLUMNS)
 
-    def plot(self) -> "Figure":
-        """Plot the watched signals with the training and the spans in which an alarm was active.
-
-        Raises:
-            InputError: matplotlib is not installed.
-        """
-        return draw(self._panels())
-
     def _panels(self) -> list[Panel]:
         record: Record = self.record
         inputs, outputs = tuple(self.result.signals.inputs), tuple(self.result.signals.outputs)
@@ -96,14 +84,9 @@ class BacktestResult(Shown[Backtest]):
             marks += [Mark(start, "alarm" if not n else "", "alarm", end=end) for n, (start, end) in enumerate(spans)]
         return signal_panels(record, inputs, names=(*outputs, *inputs), marks=tuple(marks))
 
-    def to_html(self, file: str | Path) -> None:
-        """Write the alarms and the plots as one page.
-
-        Raises:
-            InputError: the file cannot be written.
-        """
+    def _page(self) -> str:
         name = self.record.name
-        write_page(file, f"Back-test of {name}", self._repr_html_(), self._panels(), name)
+        return page_of(f"Back-test of {name}", self._repr_html_(), self._panels(), name)
 
 
 def backtest(record: Record, process: ProcessLike | None = None, **settings: Any) -> BacktestResult:

@@ -10,8 +10,7 @@ from msgspec.structs import replace
 
 from reactorwatch import html
 from reactorwatch.api.records import ProcessLike, check_signals, process_of
-from reactorwatch.api.report_origin import report_origin
-from reactorwatch.api.shown import Shown
+from reactorwatch.api.shown import Shown, report_origin
 from reactorwatch.description.process import Process
 from reactorwatch.description.read import find_process
 from reactorwatch.description.toml_file import add_description
@@ -19,17 +18,15 @@ from reactorwatch.diagnosis.diagnose import diagnose as find_causes
 from reactorwatch.diagnosis.record_checks import make_run
 from reactorwatch.diagnosis.report.panels import outputs
 from reactorwatch.diagnosis.result import Diagnosis
-from reactorwatch.figures import draw
+from reactorwatch.figures import Panel
 from reactorwatch.optional import frame_of_rows
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.extended_model import parse_extended_model
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import Record
-from reactorwatch.records.write import atomic_write
 from reactorwatch.sentences.diagnosis import describe_causes, describe_size, describe_timing, describe_verdict
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
     from pandas import DataFrame
 
 COLUMNS = ("explanation", "delta_bic", "cause", "profile", "label", "location", "size", "size_sd", "unit", "onset_min")
@@ -114,26 +111,14 @@ class DiagnosisResult(Shown[Diagnosis]):
                 rows.append(dict(zip(COLUMNS, (*values, *sizes), strict=True)))
         return frame_of_rows(rows, COLUMNS)
 
-    def plot(self) -> "Figure":
-        """Plot the measured outputs with the simulation as it was and the extended one, and the onsets of causes.
+    def _panels(self) -> list[Panel]:
+        return outputs(self.result, self.model)
 
-        Raises:
-            InputError: matplotlib is not installed.
-        """
-        return draw(outputs(self.result, self.model))
-
-    def to_html(self, file: str | Path) -> None:
-        """Write the report as one page.
-
-        Raises:
-            InputError: the file cannot be written.
-        """
+    def _page(self) -> str:
         from reactorwatch.diagnosis.report.page import as_page
 
         names, origin = (self.record.name, "extended.json", "experiment.csv"), report_origin(Path(self.record.name), {})
-        page = as_page(self.result, self.model, self.effects, *names, on_the_bus=False, origin=origin)
-        with atomic_write(Path(file)) as temporary:
-            temporary.write_text(page, encoding="utf-8")
+        return as_page(self.result, self.model, self.effects, *names, on_the_bus=False, origin=origin)
 
 
 def diagnose(

@@ -3,14 +3,20 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-import msgspec
 import numpy as np
 
 from reactorwatch import html
-from reactorwatch.api.record_view import record_html, signal_panels
-from reactorwatch.api.records import ProcessLike, Record, measured_fields, model_of, process_of
+from reactorwatch.api.records import (
+    ProcessLike,
+    Record,
+    measured_fields,
+    model_of,
+    process_of,
+    record_html,
+    signal_panels,
+)
 from reactorwatch.arrays import Array
 from reactorwatch.diagnosis.record_checks import check_values, find_wrong_unit
 from reactorwatch.errors import InputError
@@ -23,18 +29,7 @@ from reactorwatch.process.simulate import Simulator
 from reactorwatch.process.steady_state import complete_state
 from reactorwatch.records.record import Record as MeasuredRecord
 from reactorwatch.records.record import join_runs
-
-
-class Rmse(NamedTuple):
-    """Root mean square difference between a simulated and a measured output.
-
-    Attributes:
-        value: the difference.
-        unit: unit of the output.
-    """
-
-    value: float
-    unit: str
+from reactorwatch.results.simulation import Rmse, SimulationReport
 
 
 @dataclass(frozen=True, init=False)
@@ -182,15 +177,9 @@ def _fit_start(simulator: Simulator, measured: MeasuredRecord, inputs: Array, st
 
 
 def report(
-    measured: MeasuredRecord,
-    simulated: MeasuredRecord,
-    model: ProcessModel,
-    out: Path | None,
-    *,
-    settle: int = 0,
-    as_json: bool,
-) -> str:
-    """Format the root mean square difference between simulation and record, by signal.
+    measured: MeasuredRecord, simulated: MeasuredRecord, model: ProcessModel, out: Path | None, settle: int = 0
+) -> SimulationReport:
+    """Compare a simulation with its record.
 
     Args:
         measured: the record.
@@ -198,20 +187,13 @@ def report(
         model: the process.
         out: file of the simulation; None: it could not be written.
         settle: first rows of each run that are left out.
-        as_json: format as a JSON object.
     """
-    rmse = root_mean_squares(measured, simulated, model, settle)
     remarks = [sentence for law in laws_of(model) for sentence in law.outside(simulated.columns)]
-    if as_json:
-        result = {
-            "file": None if out is None else str(out),
-            "rows": measured.rows,
-            "runs": len(measured.run_starts),
-            "rmse": {name: item._asdict() for name, item in rmse.items()},
-            **({"remarks": remarks} if model.laws else {}),
-        }
-        return msgspec.json.encode(result).decode()
-    parts = ", ".join(f"{name} {item.value:.3g} {item.unit}" for name, item in rmse.items())
-    written = "not written" if out is None else f"wrote {out}"
-    line = f"{written}: {measured.rows} rows; root mean square difference from the record: {parts}"
-    return "\n".join([line, *(f"note: {remark}" for remark in [*measured.remarks, *remarks])])
+    return SimulationReport(
+        file=None if out is None else str(out),
+        rows=measured.rows,
+        runs=len(measured.run_starts),
+        rmse=root_mean_squares(measured, simulated, model, settle),
+        remarks=remarks if model.laws else None,
+        notes=tuple(measured.remarks),
+    )

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from reactorwatch.api.diagnosis import Case, DiagnosisResult, diagnose_case
 from reactorwatch.api.files import record_of_process
-from reactorwatch.api.report_origin import report_origin
+from reactorwatch.api.shown import report_origin
 from reactorwatch.arrays import Array
 from reactorwatch.cli.batch import SUMMARY, FileOptions, Job, JobKind, JobResult, Row, as_table, make_jobs
 from reactorwatch.cli.display import json_line

@@ -187,7 +187,7 @@ class _Host:
             llvm.load_library_permanently(find_library("m"))
         self._triple = llvm.get_process_triple()
         self._cpu, self._features = llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten()
-        self._cache = user_cache()
+        self._cache = CodeCache(platformdirs.user_cache_path("reactorwatch") / "machine_code")
 
     def load(self, function: ca.Function, loop: RowLoop) -> llvm.ExecutionEngine:
         """Engine with the machine code of a function, from the cache if it was compiled before."""
@@ -303,8 +303,3 @@ class CodeCache:
         if len(entries) > self._capacity:
             for item in sorted(entries, key=lambda item: item.stat().st_mtime_ns)[: self._evicted]:
                 Path(item.path).unlink(missing_ok=True)
-
-
-def user_cache() -> CodeCache:
-    """The cache of the current user."""
-    return CodeCache(platformdirs.user_cache_path("reactorwatch") / "machine_code")

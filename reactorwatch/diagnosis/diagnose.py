@@ -201,6 +201,7 @@ def diagnose(
         samples=run.time_min.size,
         runs=len(record.run_starts),
         span_min=record.span_min,
+        seconds=0.0,
         verdict=verdict,
         causes=causes,
         alternatives=tuple(_alternative(search, item, result.noise, best.bic, record) for item in alternatives),

@@ -374,7 +374,7 @@ class Diagnosis(Result, frozen=True, kw_only=True):
     samples: int
     runs: int
     span_min: float
-    seconds: float = 0.0
+    seconds: float
     verdict: str
     causes: tuple[Cause, ...]
     alternatives: tuple[Alternative, ...]

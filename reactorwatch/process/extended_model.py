@@ -92,17 +92,16 @@ class ExtendedModel:
         Raises:
             InputError: there is no such model, or it cannot have these parameters or effects.
         """
-        model = self._build_from_catalogue() if self.equations is None else self.equations
+        model = self.equations
+        if model is None:
+            nominal = {item.name: item for item in (make() for make in MODELS)}
+            if self.name not in nominal:
+                raise InputError(f"unknown model {self.name!r} (valid: {', '.join(nominal)})")
+            try:
+                model = extend(nominal[self.name].with_values(self.parameters), self.effects, self.laws)
+            except ValueError as error:
+                raise InputError(str(error)) from error
         return replace(model, uncertain=self.uncertain) if self.uncertain else model
-
-    def _build_from_catalogue(self) -> ProcessModel:
-        nominal = {item.name: item for item in (make() for make in MODELS)}
-        if self.name not in nominal:
-            raise InputError(f"unknown model {self.name!r} (valid: {', '.join(nominal)})")
-        try:
-            return extend(nominal[self.name].with_values(self.parameters), self.effects, self.laws)
-        except ValueError as error:
-            raise InputError(str(error)) from error
 
     def rebase(self, zero_ns: int) -> "ExtendedModel":
         """Copy with minutes counted from another time; unchanged where its own zero is unknown."""
@@ -164,21 +163,12 @@ def parse_extended_model(text: str | bytes) -> ExtendedModel:
     limits().check("effects", "the number of effects and laws", len(file.effects) + len(file.laws))
     if file.format != FORMAT:
         raise InputError(f"format must be {FORMAT!r}, got {file.format!r}")
+    extended = ExtendedModel(file.model, zero_ns=file.zero_ns, description=file.process, uncertain=file.uncertain)
     if file.equations is not None:
-        equations = build_equations(file.model, file.equations)
-        return ExtendedModel(
-            file.model, zero_ns=file.zero_ns, equations=equations, description=file.process, uncertain=file.uncertain
-        )
-    effects = named_effects(ExtendedModel(file.model).build())
-    extended = ExtendedModel(
-        file.model,
-        tuple(parse_fault(item, effects).with_defaults() for item in file.effects),
-        file.parameters,
-        file.zero_ns,
-        file.laws,
-        description=file.process,
-        uncertain=file.uncertain,
-    )
+        return replace(extended, equations=build_equations(file.model, file.equations))
+    known = named_effects(ExtendedModel(file.model).build())
+    effects = tuple(parse_fault(item, known).with_defaults() for item in file.effects)
+    extended = replace(extended, effects=effects, parameters=file.parameters, laws=file.laws)
     extended.build()  # reports invalid combinations now
     return extended
 
@@ -215,13 +205,11 @@ def extended_model_of(
 def are_named(extended: ExtendedModel) -> bool:
     """True if the catalogue has the effects of an extended model, so that their names are enough."""
     own = EFFECTS_OF.get(extended.name, ())
-    return all(
-        item.effect.is_generic or any(_are_equal(item.effect, effect) for effect in own) for item in extended.effects
-    )
 
+    def is_known(effect: Effect) -> bool:
+        return any(type(item) is type(effect) and vars(item) == vars(effect) for item in own)
 
-def _are_equal(one: Effect, other: Effect) -> bool:
-    return one is other or (type(one) is type(other) and vars(one) == vars(other))
+    return all(item.effect.is_generic or is_known(item.effect) for item in extended.effects)
 
 
 def is_complete(extended: ExtendedModel, model: ProcessModel) -> bool:
@@ -260,7 +248,6 @@ _UNARY = (
 )
 _BINARY = "add sub mul div pow constpow lt le eq ne and or fmod copysign fmin fmax atan2 hypot remainder if_else_zero"
 UNARY, BINARY = frozenset(_UNARY.split()), frozenset(_BINARY.split())
-
 _CODES = {name: getattr(ca, f"OP_{name.upper()}") for name in (*UNARY, *BINARY)}
 _NAMES = {code: name for name, code in _CODES.items()}
 
@@ -396,11 +383,8 @@ def _to_steps(symbols: Iterable[ca.SX], expressions: Iterable[ca.SX]) -> tuple[t
     results = [0] * len(dense)
     at: dict[int, int] = {}  # newest step by place of the function's memory
     for index in range(function.n_instructions()):
-        code, given, into = (
-            function.instruction_id(index),
-            function.instruction_input(index),
-            function.instruction_output(index),
-        )
+        code, given = function.instruction_id(index), function.instruction_input(index)
+        into = function.instruction_output(index)
         if code == ca.OP_OUTPUT:
             results[into[1]] = at[given[0]]
             continue

@@ -277,17 +277,13 @@ class Simulator:
             SimulationError: the equations cannot be integrated further.
         """
         inputs, start, p = self._check(time_min, inputs, start, changes)
-        start = self._complete_start(start, inputs[0], p, float(time_min[0]))
+        if start.size < len(self.model.states):
+            start = np.array(self._complete(start, inputs[0], p, float(time_min[0]))).ravel()
+        start = self._stepper.start_row(start, inputs[0], p, float(time_min[0]))
         grid = step_grid(time_min, p[self._breakpoints])
         states = np.vstack([start, self._run_steps(grid, inputs, start, p)[grid.end_of_row]])
-        (y,) = _compiled_outputs(self.model).map(states, inputs, p, time_min)
+        (y,) = compiled_outputs(self.model).map(states, inputs, p, time_min)
         return Trajectory(time_min, states, y[:, :, 0])
-
-    def _complete_start(self, start: Array, u: Array, p: Array, start_min: float) -> Array:
-        """Full state after the jumps at the first row."""
-        if start.size < len(self.model.states):
-            start = np.array(self._complete(start, u, p, start_min)).ravel()
-        return self._stepper.start_row(start, u, p, start_min)
 
     def _run_steps(self, grid: StepGrid, inputs: Array, start: Array, p: Array) -> Array:
         """State after each step.
@@ -362,7 +358,7 @@ def _compiled_steps(model: ProcessModel) -> CompiledFunction:
 
 
 @lru_cache(maxsize=MODEL_CACHE_SIZE)
-def _compiled_outputs(model: ProcessModel) -> CompiledFunction:
+def compiled_outputs(model: ProcessModel) -> CompiledFunction:
     """(x, u, p, t) -> y."""
     x, u, p, t, y = model.output_expressions()
     return CompiledFunction(ca.Function("outputs", [x, u, p, t], [y]), shared=[2])

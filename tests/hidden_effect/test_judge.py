@@ -42,6 +42,7 @@ def make_diagnosis(
         samples=11,
         runs=1,
         span_min=10.0,
+        seconds=0.0,
         verdict=verdict,
         causes=tuple(cause(name, "step") for name in names),
         alternatives=tuple(Alternative(tuple(cause(part, "ramp") for part in item.split("+")), 3.0) for item in others),

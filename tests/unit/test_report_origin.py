@@ -3,7 +3,7 @@
 import hashlib
 from pathlib import Path
 
-from reactorwatch.api.report_origin import report_origin
+from reactorwatch.api.shown import report_origin
 from reactorwatch.diagnosis.report.page import as_page
 from reactorwatch.process.library.cstr import EFFECTS, cstr
 from reactorwatch.version import this_build

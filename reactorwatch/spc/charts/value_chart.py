@@ -171,8 +171,7 @@ def average_rows(residuals: Array, weight: float) -> Array:
     """
     averages, average = np.empty_like(residuals), np.zeros(residuals.shape[1])
     for row, residual in enumerate(residuals):
-        average = average + weight * (residual - average)
-        averages[row] = average
+        averages[row] = average = average + weight * (residual - average)
     return averages[min(int(2.0 / weight), len(averages) // 2) :]
 
 
@@ -294,8 +293,7 @@ class StatisticsChart(ValueChart):
     @classmethod
     def edges(cls, baseline: ValueBaseline) -> list[int]:
         """First row of each piece of the training, and the number of its rows; see `pieces`."""
-        edges: list[int] = np.linspace(0, len(baseline.values), BLOCKS * cls.pieces + 1).astype(int).tolist()
-        return edges
+        return list(map(int, np.linspace(0, len(baseline.values), BLOCKS * cls.pieces + 1)))
 
     @classmethod
     def shrinkage(cls, model: Model, held_out: int, rows: int) -> float:
@@ -305,30 +303,21 @@ class StatisticsChart(ValueChart):
     @classmethod
     def design(cls, baseline: ValueBaseline) -> Self:
         """See `ValueChart`."""
-        model, averages = cls.fit(baseline.values, baseline), cls.averages(baseline)
-        centre, matrix = adjustment(baseline.values / (scale := baseline.values.std(axis=0, ddof=1)))
+        values, averages = baseline.values, cls.averages(baseline)
+        model, scale = cls.fit(values, baseline), values.std(axis=0, ddof=1)
+        centre, matrix = adjustment(values / scale)
         model |= {"root_means": averages.means, "root_sds": averages.row_sds, "average_sds": averages.sds}
-        model["usual_parts"] = cls._usual_parts(model, baseline.values)
+        windows = (values[row - cls.rows_before : row + 1] for row in range(cls.rows_before, len(values)))
+        model["usual_parts"] = np.mean([cls.parts(model, window) for window in windows], axis=0)
         model |= {"centre_of_missing": centre * scale, "matrix_of_missing": matrix / scale}
         return cls(baseline.names, model, baseline.settings[cls.weight_key], cls.limit_of(baseline, averages))
 
     @classmethod
-    def _usual_parts(cls, model: Model, values: Array) -> Array:
-        windows = (values[row - cls.rows_before : row + 1] for row in range(cls.rows_before, len(values)))
-        return np.asarray(np.mean([cls.parts(model, window) for window in windows], axis=0))
-
-    @classmethod
     def averages(cls, baseline: ValueBaseline) -> Averages:
         """Averages of the training's statistics, each row judged by the model of the other blocks."""
-        return cls.spread(cls.held_out_roots(baseline), baseline)
-
-    @classmethod
-    def spread(cls, roots: Array, baseline: ValueBaseline) -> Averages:
-        """Averages of cube roots, shape (rows, statistics), in which missing ones are NaN."""
-        weight = baseline.settings[cls.weight_key]
+        roots, weight = cls.held_out_roots(baseline), baseline.settings[cls.weight_key]
         learned = [learn(column, 1e-12) for column in roots.T]
-        variances = [(item.sd / item.shift_gain) ** 2 / item.rows for item in learned]
-        sds = [sqrt(average_variance(item, weight) + v) for item, v in zip(learned, variances, strict=True)]
+        sds = [sqrt(average_variance(item, weight) + (item.sd / item.shift_gain) ** 2 / item.rows) for item in learned]
         freedom = min(degrees_of_freedom(item, weight) for item in learned)
         found = Averages.of(roots, weight, np.array(sds), freedom)
         if not cls.is_skewed:

@@ -8,11 +8,18 @@ import numpy as np
 import pytest
 
 from benchmarks.diagnosis_study import judge_record, section
-from benchmarks.harness.pool import Pool
-from benchmarks.harness.tables import replace_between
+from benchmarks.harness.study import Pool, replace_between
 from benchmarks.hidden.classes import CLASSES, NEARLY, draw_record, find_class, seed_of
-from benchmarks.hidden.score import Score, Share, confusion, failures, main_table, percent, reliability_table
-from benchmarks.hidden.suspects import SuspectsJudged
+from benchmarks.hidden.score import (
+    Score,
+    Share,
+    SuspectsJudged,
+    confusion,
+    failures,
+    main_table,
+    percent,
+    reliability_table,
+)
 from reactorwatch.errors import InputError
 from tests.hidden_effect.draw import draw
 from tests.hidden_effect.excitation import MEDIUM_NOISE

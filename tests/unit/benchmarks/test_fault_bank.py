@@ -24,8 +24,8 @@ from benchmarks.faults.detectors import (
     outcome_of,
     suspicion,
 )
-from benchmarks.faults.oracle import CAUSES, log_likelihood_ratio, oracle_delay_min, oracle_suspect
 from benchmarks.faults.study import (
+    CAUSES,
     MONITOR,
     ORACLE,
     CaseResult,
@@ -33,6 +33,9 @@ from benchmarks.faults.study import (
     Rate,
     Widths,
     detectors,
+    log_likelihood_ratio,
+    oracle_delay_min,
+    oracle_suspect,
     rows_to_false_alarm,
     run_case,
     run_fault_free,

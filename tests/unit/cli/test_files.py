@@ -28,6 +28,7 @@ from reactorwatch.process.library.cstr import cstr
 from reactorwatch.records.record import Record, join_runs
 from reactorwatch.records.write import check_folder_name
 from reactorwatch.sentences.backtest import backtest_text
+from reactorwatch.sentences.models import simulation_text
 from recorder.files.recording import FILE_INDEX
 from recorder.files.writer import RecordingWriter
 from recorder.tools.convert import import_csv
@@ -105,8 +106,9 @@ def test_each_run_is_simulated_from_its_own_first_row(whole: Record, tmp_path: P
     assert np.array_equal(simulated.columns["T"], join_runs(alone).columns["T"])
     assert np.array_equal(simulated.time_min, record.time_min)
     assert simulated.runs is not None
-    assert json.loads(report(record, simulated, cstr(), tmp_path, as_json=True))["runs"] == 2
-    assert "2 runs" in report(record, simulated, cstr(), tmp_path, as_json=False)
+    compared = report(record, simulated, cstr(), tmp_path)
+    assert compared.to_dict()["runs"] == 2
+    assert "2 runs" in simulation_text(compared)
 
 
 def test_a_run_of_one_row_is_simulated_as_that_row(whole: Record) -> None:

@@ -20,7 +20,7 @@ from reactorwatch.process import MODELS
 from reactorwatch.process.operation import Controller
 from reactorwatch.process.simulate import Simulator
 from reactorwatch.runtime.config import section
-from tests.unit.plant_node.rows import column, rows
+from tests.unit.plant_node.reactor import column, rows
 
 NAMES = [make().name for make in MODELS]
 RIG = """

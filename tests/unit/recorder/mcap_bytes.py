@@ -54,8 +54,10 @@ def index_of(chunk: Chunk, record: bytes, at: int) -> ChunkIndex:
     )
 
 
-def recording(chunks: list[Chunk], indexed_bytes: int | None = None, *, indexed: bool = True) -> bytes:
-    """A file of these chunks; the index claims another size of the last one, if it is given."""
+def recording(
+    chunks: list[Chunk], indexed_bytes: int | None = None, *, indexed: bool = True, further: bytes = b""
+) -> bytes:
+    """A file of these chunks; the index may claim another size of the last one, and have further records."""
     content = MCAP0_MAGIC + bytes_of(Header(profile="", library=""))
     indexes = []
     for item in chunks:
@@ -67,7 +69,7 @@ def recording(chunks: list[Chunk], indexed_bytes: int | None = None, *, indexed:
     content += bytes_of(DataEnd(0))
     start = len(content)
     if indexed:
-        content += DESCRIBED + bytes_of(*indexes)
+        content += DESCRIBED + bytes_of(*indexes) + further
     footer = Footer(summary_start=start if indexed else 0, summary_offset_start=0, summary_crc=0)
     return content + bytes_of(footer) + MCAP0_MAGIC
 

@@ -72,13 +72,6 @@ def test_a_cut_starts_with_the_latched_messages(tmp_path: Path) -> None:
     assert [entry[:3] for entry in Recording(again).messages() if entry.latched] == [entry[:3] for entry in standing]
 
 
-def test_a_cut_of_several_files_goes_across_them(tmp_path: Path) -> None:
-    halves = [recorded(tmp_path / "b.mcap", ENTRIES[800:]), recorded(tmp_path / "a.mcap", ENTRIES[:800])]
-    window = Window((ENTRIES[700].log_time_ns, ENTRIES[899].log_time_ns))
-    assert cut(halves, tmp_path / "cut.mcap", window, {}) == 200
-    assert [entry for entry in Recording(tmp_path / "cut.mcap").messages() if not entry.latched] == ENTRIES[700:900]
-
-
 def test_what_cannot_be_read_is_cut_out_as_it_is(tmp_path: Path) -> None:
     strange = RecordedMessage(
         "reactor/cstr/sample/T", b"\xff\xff", encoding_of(messages.Sample), ENTRIES[10].log_time_ns, 5

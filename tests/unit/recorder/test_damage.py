@@ -39,6 +39,7 @@ from recorder.tools.convert import read_record
 from recorder.tools.inspect import inspect, zero_ns_of
 from tests.unit.recorder import golden
 from tests.unit.recorder.mcap_bytes import DESCRIBED, PACKED, SOUND, bytes_of, chunk, message, recording
+from tests.unit.recorder.recording import recorded
 
 FOOTER_BYTES, MAGIC_BYTES = 29, 8
 
@@ -170,13 +171,7 @@ SAMPLES = [entry for entry in golden.entries() if "/sample/" in entry.key][:60]
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     """A recording of three chunks."""
-    path = tmp_path_factory.mktemp("whole") / "run.mcap"
-    with RecordingWriter(path, {}) as writer:
-        for number, entry in enumerate(SAMPLES):
-            writer.write(entry)
-            if number % 20 == 19:
-                writer.flush()
-    return path.read_bytes()
+    return recorded(tmp_path_factory.mktemp("whole") / "run.mcap", SAMPLES, 20).read_bytes()
 
 
 def read_or_refuse(path: Path) -> list[RecordedMessage] | str:
@@ -242,9 +237,7 @@ def test_every_way_of_reading_reports_the_same_error_at_the_call(tmp_path: Path,
 
 def test_damaged_metadata_of_a_later_file_stop_only_what_needs_those_of_all_files(tmp_path: Path) -> None:
     for number, entries in enumerate((SAMPLES[:30], SAMPLES[30:])):
-        with RecordingWriter(tmp_path / f"run-{number}.mcap", {"plant": "cstr"}) as writer:
-            for entry in entries:
-                writer.write(entry)
+        recorded(tmp_path / f"run-{number}.mcap", entries, metadata={"plant": "cstr"})
     later = tmp_path / "run-1.mcap"
     (item,) = Reader(later).summary.metadata_indexes
     content = bytearray(later.read_bytes())
@@ -260,8 +253,6 @@ def test_damaged_metadata_of_a_later_file_stop_only_what_needs_those_of_all_file
 
 
 BOMB_BYTES = 40_000_000
-
-
 ZEROS = bytes(BOMB_BYTES)
 MESSAGES = DESCRIBED + message(3) * (BOMB_BYTES // len(message(3)))
 
@@ -274,28 +265,16 @@ BOMBS: dict[str, Callable[[str], tuple[Chunk, int | None]]] = {
     "less than it claims": lambda packing: (chunk(message(3), packing, claimed=900_000), None),
     "not what the index claims": lambda packing: (chunk(message(3), packing), 7),
 }
-READERS: dict[str, Callable[[Path, Path], object]] = {
-    "read": lambda path, _: list(Recording(path).messages()),
-    "cut": lambda path, out: cut([path], out, Window((0, LATEST_NS)), {}),
-}
-
-
-@pytest.fixture(scope="module")
-def bombs() -> dict[tuple[str, str], tuple[Chunk, int | None]]:
-    return {(name, packing): make(packing) for name, make in BOMBS.items() for packing in ("zstd", "lz4")}
 
 
 @pytest.mark.parametrize("packing", ["zstd", "lz4"])
 @pytest.mark.parametrize("name", BOMBS)
 def test_every_reader_refuses_it_in_one_line_and_takes_no_more_memory_than_is_allowed(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    bombs: dict[tuple[str, str], tuple[Chunk, int | None]],
-    name: str,
-    packing: str,
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, packing: str
 ) -> None:
+    """Every command reads by one of these."""
     monkeypatch.setenv(LARGEST_MB, "1")
-    bomb, indexed_bytes = bombs[name, packing]
+    bomb, indexed_bytes = BOMBS[name](packing)
     files = {"indexed": recording([SOUND, bomb], indexed_bytes)}
     if indexed_bytes is None:
         files["unindexed"] = recording([SOUND, bomb], indexed=False)
@@ -304,9 +283,10 @@ def test_every_reader_refuses_it_in_one_line_and_takes_no_more_memory_than_is_al
     for content in files.values():
         path.write_bytes(content)
         tracemalloc.start()
-        for read in READERS.values():
-            with pytest.raises(InputError, match=r"^[^\n]*run\.mcap[^\n]*$"):
-                read(path, out)
+        with pytest.raises(InputError, match=r"^[^\n]*run\.mcap[^\n]*$"):
+            list(Recording(path).messages())
+        with pytest.raises(InputError, match=r"^[^\n]*run\.mcap[^\n]*$"):
+            cut([path], out, Window((0, LATEST_NS)), {})
         assert not out.exists()
         seen = inspect(path)
         saved = recover(path, out)
@@ -318,6 +298,20 @@ def test_every_reader_refuses_it_in_one_line_and_takes_no_more_memory_than_is_al
         assert "\n" not in seen.damages[0]
         assert peak_bytes < 6 * 10**6 + 4 * len(content)
         out.unlink()
+
+
+def test_a_chunk_among_the_records_of_the_index_and_in_place_of_metadata_is_not_decompressed(tmp_path: Path) -> None:
+    path, bomb = tmp_path / "run.mcap", chunk(ZEROS)
+    whole = recording([SOUND, bomb])
+    named = MetadataIndex(offset=whole.index(bytes_of(bomb)), length=len(bytes_of(bomb)), name="reactorwatch")
+    tracemalloc.start()
+    path.write_bytes(recording([SOUND], further=bytes_of(bomb)))
+    assert len(list(Recording(path).messages())) == 2
+    path.write_bytes(recording([SOUND, bomb], further=bytes_of(named)))
+    with pytest.raises(InputError, match=r"run\.mcap: its metadata cannot be read"):
+        _ = Recording(path).metadata
+    assert tracemalloc.get_traced_memory()[1] < BOMB_BYTES / 4
+    tracemalloc.stop()
 
 
 @pytest.mark.parametrize("packing", PACKED)

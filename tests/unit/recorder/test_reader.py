@@ -29,11 +29,6 @@ def path(tmp_path: Path) -> Path:
     return tmp_path / "run.mcap"
 
 
-@pytest.mark.parametrize("tolerant", [True, False])
-def test_a_whole_file_is_read_without_damage(path: Path, *, tolerant: bool) -> None:
-    assert read(path, WHOLE, tolerant=tolerant) == ([1, 4, 5, 9], [])
-
-
 def test_a_file_whose_beginning_is_damaged_is_read_from_its_first_chunk(path: Path) -> None:
     for first, last in ((0, 1), (3, 4), (0, 20)):
         content = WHOLE[:first] + b"?" * (last - first) + WHOLE[last:]

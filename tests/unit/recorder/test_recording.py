@@ -326,13 +326,6 @@ def test_records_that_are_private_to_another_program_are_passed_over(tmp_path: P
     assert [entry.log_time_ns for entry in Recording(path).messages()] == [1, 2]
 
 
-def test_a_record_holds_the_samples_by_time(tmp_path: Path) -> None:
-    record = read_record(recorded(tmp_path / "run.mcap", list(golden.entries())))
-    assert record.time_min.tolist() == [row * 6 / 60 for row in range(golden.ROWS)]
-    for signal in ("qc", "C", "T"):
-        assert record.columns[signal].tolist() == [golden.value(signal, row) for row in range(golden.ROWS)]
-
-
 def test_a_record_has_nan_where_a_signal_was_not_measured(tmp_path: Path) -> None:
     minute = MINUTE
     bad = messages.Sample(time_ns=3 * minute, sequence=3, value=7.0, quality=messages.QUALITY_BAD)

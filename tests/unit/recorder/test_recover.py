@@ -267,26 +267,16 @@ def all_parts(notes: str = "") -> Parts:
     return "ros2", metadata, {"plant.png": PICTURE}, 1
 
 
-def test_a_cut_keeps_them(tmp_path: Path) -> None:
-    source = foreign(tmp_path / "a.mcap", notes="a")
-    cut([source], tmp_path / "new.mcap", Window((0, LATEST_NS)), {})
-    assert parts(tmp_path / "new.mcap") == all_parts("a") == parts(source)
-
-
-def test_a_cut_of_two_recordings_keeps_them_and_writes_equal_ones_once(tmp_path: Path) -> None:
-    sources = [foreign(tmp_path / "a.mcap"), foreign(tmp_path / "b.mcap", minute=1, notes="b")]
-    cut(sources, tmp_path / "new.mcap", Window((0, LATEST_NS)), {})
-    assert parts(tmp_path / "new.mcap") == all_parts("b")
-
-
-def test_of_several_profiles_none_is_kept(tmp_path: Path) -> None:
-    cut(
-        [foreign(tmp_path / "a.mcap"), foreign(tmp_path / "b.mcap", "x", 1)],
-        tmp_path / "new.mcap",
-        Window((0, 2**63 - 1)),
-        {},
-    )
-    assert parts(tmp_path / "new.mcap")[0] == ""
+def test_a_cut_keeps_them_equal_ones_once_and_of_several_profiles_none(
+    tmp_path: Path,
+) -> None:
+    source, new, always = foreign(tmp_path / "a.mcap", notes="a"), tmp_path / "new.mcap", Window((0, LATEST_NS))
+    cut([source], new, always, {})
+    assert parts(new) == all_parts("a") == parts(source)
+    cut([foreign(tmp_path / "c.mcap"), foreign(tmp_path / "b.mcap", minute=1, notes="b")], new, always, {})
+    assert parts(new) == all_parts("b")
+    cut([source, foreign(tmp_path / "d.mcap", "x", 1)], new, always, {})
+    assert parts(new)[0] == ""
 
 
 @pytest.mark.parametrize("cut_off", [0, 1, 50])

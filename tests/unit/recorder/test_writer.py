@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from mcap.reader import make_reader
 from mcap.records import Attachment
 
 from reactorwatch.contract.codec import encoding_of
@@ -23,7 +22,7 @@ from reactorwatch.contract.messages_pb2 import QUALITY_GOOD, Sample
 from reactorwatch.errors import InputError
 from recorder import RecordedMessage
 from recorder.files.copies import recover
-from recorder.files.part_file import PART, PartFile, is_locked, lock_orphan, open_recording
+from recorder.files.part_file import PART, PartFile, is_locked, lock_orphan
 from recorder.files.reader import Reader, StoredChannel, metadata_records
 from recorder.files.recording import Recording
 from recorder.files.writer import RecordingWriter, WriteError, check_free
@@ -127,24 +126,6 @@ def test_the_library_meets_no_error_of_the_disk(
     writer.abandon()
     assert inside
     assert not any(inside)
-
-
-def test_the_library_reads_a_recording_and_its_statistics_agree(tmp_path: Path) -> None:
-    path = tmp_path / "run.mcap"
-    with RecordingWriter(path, {"plant": "cstr"}) as writer:
-        for number, entry in enumerate(ENTRIES):
-            writer.write(entry)
-            if number % 7 == 6:
-                writer.flush()
-    with path.open("rb") as stream:
-        reader = make_reader(stream, validate_crcs=True)
-        found = [(channel.topic, message.data) for _, channel, message in reader.iter_messages(log_time_order=False)]
-        summary = reader.get_summary()
-    assert found == [(entry.key, entry.payload) for entry in ENTRIES]
-    assert summary is not None
-    assert summary.statistics is not None
-    assert summary.statistics.message_count == len(ENTRIES)
-    assert summary.statistics.chunk_count == -(-len(ENTRIES) // 7)
 
 
 def test_a_recording_that_cannot_be_started_leaves_no_file(tmp_path: Path) -> None:
@@ -306,50 +287,12 @@ def test_the_system_is_asked_to_write_all_bytes_to_the_disk(
     assert synced == [(number, True, len(DATA))]
 
 
-def test_bytes_are_buffered_until_they_are_drained_and_dropped_when_the_file_is_abandoned(tmp_path: Path) -> None:
-    path = tmp_path / f"run.mcap{PART}"
-    file = PartFile(path)
-    assert file.write(b"abc") == 3
-    file.flush()
-    assert (file.tell(), file.drained, path.stat().st_size) == (3, 0, 0)
-    file.drain()
-    assert (file.tell(), file.drained, path.read_bytes()) == (3, 3, b"abc")
-    file.write(b"de")
-    assert (file.tell(), file.closed) == (5, False)
-    file.abandon()
-    assert (file.tell(), file.closed, path.read_bytes()) == (3, True, b"abc")
-    file.abandon()
-
-
-def test_a_finished_file_has_its_complete_name_and_no_lock(tmp_path: Path) -> None:
-    file, complete = open_part(tmp_path), tmp_path / "run.mcap"
-    file.write(DATA)
-    assert is_locked(file.path)
-    file.finish(complete)
-    assert (file.closed, file.path.exists(), complete.read_bytes()) == (True, False, DATA)
-    assert not is_locked(complete)
-    assert not is_locked(file.path), "it does not exist"
-
-
 def test_a_file_that_cannot_be_renamed_is_closed_under_its_old_name(tmp_path: Path) -> None:
     file = open_part(tmp_path)
     file.write(DATA)
     with pytest.raises(FileNotFoundError):
         file.finish(tmp_path / "none" / "run.mcap")
     assert (file.closed, file.path.read_bytes(), is_locked(file.path)) == (True, DATA, False)
-
-
-def test_an_orphan_is_locked_by_one_process_at_a_time_and_by_none_while_it_is_written(tmp_path: Path) -> None:
-    file = open_part(tmp_path)
-    with pytest.raises(InputError, match="is still being written; stop its recorder first"), lock_orphan(file.path):
-        pass
-    file.write(DATA)
-    file.drain()
-    file.abandon()
-    with lock_orphan(file.path) as stream:
-        assert stream.read() == DATA
-        assert is_locked(file.path)
-    assert not is_locked(file.path)
 
 
 def test_an_orphan_that_another_file_replaced_while_it_was_locked_is_left_alone(
@@ -368,17 +311,3 @@ def test_an_orphan_that_another_file_replaced_while_it_was_locked_is_left_alone(
     with pytest.raises(FileNotFoundError, match="is another file by now"), lock_orphan(path):
         pass
     assert not is_locked(path)
-
-
-def test_a_file_that_its_recorder_completed_meanwhile_is_opened_under_its_complete_name(tmp_path: Path) -> None:
-    complete, part = tmp_path / "run.mcap", tmp_path / f"run.mcap{PART}"
-    complete.write_bytes(DATA)
-    for path in (complete, part):
-        with open_recording(path) as stream:
-            assert stream.read() == DATA
-    part.write_bytes(b"part")
-    with open_recording(part) as stream:
-        assert stream.read() == b"part"
-    for missing in (tmp_path / "none.mcap", tmp_path / f"none.mcap{PART}"):
-        with pytest.raises(FileNotFoundError):
-            open_recording(missing)

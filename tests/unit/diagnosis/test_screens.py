@@ -1,22 +1,28 @@
-"""The linear map predicts the filters' innovations with the deviation, and its three passes agree."""
+"""The linear map predicts the filters' innovations; screens of single causes, pairs and effects with states."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.optimize import lsq_linear
 
 from reactorwatch.arrays import Array
+from reactorwatch.diagnosis.diagnose import diagnose
 from reactorwatch.diagnosis.fitting import signatures
 from reactorwatch.diagnosis.fitting.colored_noise import Noise
 from reactorwatch.diagnosis.fitting.fault_filter import FaultFilter
 from reactorwatch.diagnosis.fitting.hypothesis import Fit, Hypothesis
 from reactorwatch.diagnosis.fitting.profiles import Constant, Decay, FittedProfile, PiecewiseLinear, Ramp, Sine, Step
+from reactorwatch.diagnosis.fitting.signatures import solve_bounded
+from reactorwatch.diagnosis.result import NAMED
 from reactorwatch.diagnosis.run import Run
-from reactorwatch.diagnosis.search.screen import Screen
+from reactorwatch.diagnosis.search.dynamic_effects_screen import DynamicEffectsScreen
+from reactorwatch.diagnosis.search.pair_screen import PairScreen
+from reactorwatch.diagnosis.search.screen import DECAYS, Screen
 from reactorwatch.kalman.error_dynamics import ErrorDynamics
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.library.cstr import EFFECTS, cstr
-from tests.unit.diagnosis.runs import make_run
+from tests.unit.diagnosis.runs import make_run, record_of
 
 NOISY = Noise((0.002, 0.3), (0.001, 0.3))
 NAMES = ("coolant_flow", "reaction_rate", "temperature_bias", "concentration_gain")
@@ -120,3 +126,75 @@ def test_a_break_after_a_row_hides_no_cause(run: Run) -> None:
     for item in (ways.F, ways.G, ways.H, ways.D, ways.K, ways.w):
         assert np.all(np.isfinite(item))
     assert not np.any(ways.G[298])  # from row 299 to row 300, where the filter begins anew
+
+
+TIME_MIN: Array = np.arange(0.0, 100.0, 0.1)
+LAG = next(effect for effect in EFFECTS if effect.name == "jacket_lag")
+
+
+@pytest.mark.parametrize(
+    ("kind", "parameters"),
+    [(Step, [1.5, 40.0]), (Ramp, [1.5, 25.0]), (Decay, [1.5, 30.0, DECAYS[1] * TIME_MIN[-1]])],
+    ids=["step", "ramp", "decay"],
+)
+def test_of_all_courses_the_one_that_is_there_promises_most(kind: type[FittedProfile], parameters: list[float]) -> None:
+    random = np.random.default_rng(1)
+    g = random.standard_normal((TIME_MIN.size, 2))
+    profile = kind(TIME_MIN)
+    left = 0.1 * random.standard_normal(g.shape)
+    w = g * profile.signal(np.array(parameters)).sample_value[:, None] + left
+    run = Run(TIME_MIN, np.zeros((TIME_MIN.size, 1)), np.zeros_like(w))
+    found = DynamicEffectsScreen([LAG], run).scale_signature(LAG, w, g)
+    best = max(found, key=lambda candidate: candidate.score(run.values))
+    assert best.profile.name == profile.name
+    assert best.parameters == pytest.approx(parameters, rel=0.03)
+    # Twice the gain in log likelihood of a deviation that explains all but what is left.
+    assert best.gain == pytest.approx(np.sum(w**2) - np.sum(left**2), rel=0.01)
+
+
+FOLLOWING = Noise((0.002, 0.3), (0.001, 0.3))
+
+
+def problem(seed: int, columns: int) -> tuple[Array, Array, Array]:
+    """A matrix and a vector that little of it explains, and the coefficients that explain most."""
+    random = np.random.default_rng(seed)
+    g = random.standard_normal((400, columns)) @ (np.eye(columns) + 0.3 * random.standard_normal((columns, columns)))
+    w = random.standard_normal(400) + g @ random.standard_normal(columns)
+    return g, w, np.asarray(np.linalg.lstsq(g, w, rcond=None)[0], dtype=np.float64)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_without_bounds_a_pair_gains_what_least_squares_gain(seed: int) -> None:
+    g, w, parameters = problem(seed, 8)
+    gain, found = solve_bounded(g.T @ g, g.T @ w, np.full(8, -np.inf), np.full(8, np.inf))
+    assert gain == pytest.approx(w @ w - np.sum((w - g @ parameters) ** 2), rel=1e-6)
+    assert np.sum((g @ (found - parameters)) ** 2) < 1e-6 * gain
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_within_bounds_a_pair_promises_no_more_than_is_possible(seed: int) -> None:
+    g, w, _ = problem(seed, 8)
+    lowest, highest = np.zeros(8), np.full(8, 0.7)
+    gain, found = solve_bounded(g.T @ g, g.T @ w, lowest, highest)
+    best = lsq_linear(g, w, (lowest, highest), method="bvls").x
+    assert np.all((found >= lowest) & (found <= highest))
+    assert gain == pytest.approx(w @ w - np.sum((w - g @ found) ** 2), rel=1e-6)
+    assert gain <= (w @ w - np.sum((w - g @ best) ** 2)) * (1 + 1e-6)
+
+
+def test_the_two_that_are_there_are_promised_first_though_neither_looks_best_alone() -> None:
+    run = make_run("feed_temperature:constant:1.0", "volume:ramp:0.04@50min,end=149.9min", rows=1500)
+    screen = Screen(cstr(), EFFECTS, run)
+    hypothesis = Hypothesis(FaultFilter(cstr(), (), FOLLOWING), ())
+    fit = hypothesis.evaluate(run, ())
+    pairs = PairScreen(screen, run).candidates(screen.dynamics_of_all(hypothesis, fit, ()), (), count=3)
+    assert pairs[0].causes == {"feed_temperature", "volume"}
+    assert screen.candidates(hypothesis, fit)[0].effect.name not in pairs[0].causes
+
+
+def test_beside_another_cause_a_valve_that_sticks_is_named() -> None:
+    record = record_of("concentration_gain:step:-0.05@60min", "valve_stiction:constant:2.5", rows=1200)
+    found = diagnose(record, cstr())
+    assert found.verdict == NAMED
+    assert [cause.cause for cause in found.causes] == ["valve_stiction", "concentration_gain"]
+    assert found.causes[0].parameters["size"].value == pytest.approx(2.5, abs=0.3)  # the same for all sizes near by

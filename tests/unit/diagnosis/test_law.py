@@ -1,13 +1,16 @@
-"""The place and the law of a missing term are found in records of plants with terms that no catalogue has."""
+"""The place and the law of a missing term, with priors on parameters and under feedback too."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache
 
 import casadi as ca
 import numpy as np
 import pytest
+from msgspec import structs
 
 from reactorwatch.arrays import Array
+from reactorwatch.diagnosis.diagnose import diagnose
 from reactorwatch.diagnosis.estimates import covariances_of
 from reactorwatch.diagnosis.fitting.colored_noise import Noise
 from reactorwatch.diagnosis.fitting.fault_filter import FaultFilter
@@ -15,14 +18,21 @@ from reactorwatch.diagnosis.fitting.hypothesis import Hypothesis
 from reactorwatch.diagnosis.law.describe import describe_law, law_hypothesis
 from reactorwatch.diagnosis.law.fit import select_terms
 from reactorwatch.diagnosis.law.formula import round_reference
+from reactorwatch.diagnosis.law.shapes import find_answers, make_shape
 from reactorwatch.diagnosis.law.unknown import Unknown, find_laws, fit_places, start_places
-from reactorwatch.diagnosis.result import SD_95, Law
+from reactorwatch.diagnosis.record_checks import make_run
+from reactorwatch.diagnosis.result import SD_95, UNKNOWN, Law
 from reactorwatch.diagnosis.run import Run
-from reactorwatch.process.law import find_form
+from reactorwatch.process.law import find_form, find_place
 from reactorwatch.process.library.cstr import cstr
+from reactorwatch.process.library.cstr_operation import BOILING_FROM_K, BOILING_RATE, EXAMPLES
 from reactorwatch.process.library.three_tanks import three_tanks
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.simulate import Simulator
+from reactorwatch.records.record import Record
+from tests.hidden_effect.catalogue import named
+from tests.hidden_effect.draw import Hidden, draw
+from tests.hidden_effect.excitation import MEDIUM_NOISE, Circumstances
 
 ROWS, PERIOD_MIN = 1500, 0.1
 NOISE = {"cstr": (0.002, 0.3), "three_tanks": (0.05, 0.05, 0.05)}
@@ -127,3 +137,81 @@ def test_only_functions_that_are_worth_their_charge_are_selected() -> None:
 @pytest.mark.parametrize(("mean", "spread", "expected"), [(438.54, 4.2, 440.0), (0.0936, 0.012, 0.09), (1e4, 0.0, 1e4)])
 def test_a_reference_is_a_round_number_near_the_mean(mean: float, spread: float, expected: float) -> None:
     assert round_reference(mean, spread) == pytest.approx(expected)
+
+
+LEVELS = Noise(MEDIUM_NOISE, (0.002, 0.2))
+
+
+def drifting(cause: str, loop: str, seed: int, span_min: float = 150.0) -> Hidden:
+    """A record in which a cause drifts."""
+    (effect,) = (item for item in named() if item.name == cause)
+    return draw(seed, (effect,), Circumstances(input=loop, span_min=span_min), kinds=("free",))
+
+
+@pytest.mark.parametrize("cause", ["heat_transfer", "concentration_bias", "temperature_lag"])
+@pytest.mark.parametrize("loop", ["rich", "narrow", "few", "closed"])
+def test_the_coolant_answers_to_the_thermometer_in_closed_loop_alone(cause: str, loop: str) -> None:
+    model = cstr()
+    run = make_run(drifting(cause, loop, seed=3).record, model)
+    answers = find_answers(model, run)
+    assert answers == ({("T", "qc")} if loop == "closed" else set())
+
+
+def test_the_error_of_a_sensor_does_not_depend_on_an_input_that_answers_to_it() -> None:
+    model = cstr()
+    run = make_run(drifting("heat_transfer", "closed", seed=3).record, model)
+    nominal = Hypothesis(FaultFilter(model, (), LEVELS), ()).evaluate(run, ())
+    scales, place = start_places(model, run, nominal, LEVELS).scales, find_place(model, "thermometer")
+    x, moved = np.full((2, 2), [0.1, 438.5]), np.array([[100.0], [109.0]])
+    for known, is_constant in ((frozenset[tuple[str, str]](), False), (frozenset({("T", "qc")}), True)):
+        shape = make_shape(model, place, scales, known)
+        first, second = shape.basis(x, moved)
+        assert np.array_equal(first, second) is is_constant
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("cause", "seed"), [("heat_transfer", 10300020), ("heat_transfer", 10300022)])
+def test_a_drift_in_closed_loop_is_named_and_no_unknown_error_of_the_thermometer(cause: str, seed: int) -> None:
+    """An error that follows the coolant was better by thousands in BIC than the cause."""
+    result = diagnose(drifting(cause, "closed", seed, span_min=300.0).record, cstr())
+    assert (result.verdict, [item.cause for item in result.causes]) == ("named", [cause])
+
+
+BOILING_ROWS, STEP_MIN, NOISE_SD = 500, 0.1, (0.002, 0.3)
+
+
+def boiling_reactor() -> Record:
+    """Record of the reactor whose contents boil, from the nominal parameters."""
+    random, build = np.random.default_rng(3), EXAMPLES["unknown"].with_law
+    assert build is not None
+    time_min = STEP_MIN * np.arange(BOILING_ROWS, dtype=np.float64)
+    inputs = np.repeat(random.uniform(90.0, 111.0, (BOILING_ROWS // 10, 1)), 10, axis=0)
+    outputs = Simulator(build(cstr())).run(time_min, inputs, np.array([0.1, 438.54])).outputs
+    C, T = (outputs + np.array(NOISE_SD) * random.standard_normal(outputs.shape)).T
+    return Record(time_min, {"qc": inputs[:, 0], "C": C, "T": T}, "boiling")
+
+
+@pytest.mark.parametrize(
+    ("stated", "sds"),
+    [
+        pytest.param({"K3": 714.0}, {"K3": 14.0}, id="stated 2 % too high"),
+        pytest.param({"q": 100.0}, {"q": 0.02}, id="a flow", marks=pytest.mark.slow),
+        pytest.param({"Tf": 350.0, "Tcf": 350.0}, {"Tf": 0.02, "Tcf": 0.02}, id="temperatures", marks=pytest.mark.slow),
+    ],
+)
+def test_the_law_and_the_uncertain_parameters_are_within_their_intervals(
+    stated: Mapping[str, float], sds: Mapping[str, float]
+) -> None:
+    truth, model = cstr(), cstr().with_values(stated)
+    result = diagnose(boiling_reactor(), model, uncertain=sds)
+    assert result.verdict == UNKNOWN
+    assert result.law is not None
+    assert set(result.parameters) == set(sds)
+    for name, item in result.parameters.items():
+        assert item.nominal == stated[name]
+        assert item.estimate.sd <= 1.001 * sds[name]
+        assert abs(item.estimate.value - truth.parameter(name).value) < 4.0 * item.estimate.sd
+    assert result.law.parameters["b"].value == pytest.approx(-BOILING_RATE, abs=4.0 * result.law.parameters["b"].sd)
+    assert result.law.parameters["c"].value == pytest.approx(BOILING_FROM_K, abs=4.0 * result.law.parameters["c"].sd)
+    held = result.law.extended.parameters
+    assert all(item == structs.replace(item, value=held[name]) for name, item in result.law.parameters.items())
