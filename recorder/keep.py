@@ -242,7 +242,7 @@ def select_deletions(
 
 
 MAX_MARGINS = 10
-"""Largest time from the first alarm to the end of an interval, in margins."""
+"""Largest time from the first alarm to the end of an interval, in margins: alarms may come without an end."""
 RAISED = "raised"
 """Event of an alarm that is raised."""
 
@@ -327,7 +327,7 @@ class BlackBox:
 MAX_CHANNELS = 65_535
 """Channels in a file: https://mcap.dev/spec#channel-op0x04"""
 MAX_OTHER_CHANNELS = 4000
-"""Channels in a file for messages that are not of the product."""
+"""Channels in a file for messages that are not of the product, out of those that `MAX_KEYS` leaves."""
 MAX_KEYS = 60_000
 """Keys of the product in a file, latched messages included; some channels of the format stay free."""
 

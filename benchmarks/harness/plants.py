@@ -4,7 +4,6 @@ The equations of the differing plants are written out in NumPy and integrated by
 fixed steps, for all plants of a kind alike; the other records are by the product's simulator.
 """
 
-import random
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -190,11 +189,3 @@ def without_equations(reference: ReferenceName = "auto") -> MonitorConfig:
         smallest_sd={},
         priorities={},
     )
-
-
-def draw_bad_value(draw: random.Random, lower: float, upper: float) -> Callable[[], float]:
-    """A value that a broken sensor may show, with noise or without: in the range, at its edges, or anywhere."""
-    far = draw.choice((-1.0, 1.0)) * 10.0 ** draw.uniform(-3.0, 14.9)
-    value = draw.choice((draw.uniform(lower, upper), lower, upper, far, -999.0, 9999.0, 65535.0))
-    spread = draw.choice((0.0, 0.0, 1e-3, 0.1)) * (upper - lower)
-    return lambda: value + spread * draw.random()

@@ -28,7 +28,6 @@ from monitor_node.learn.training_rows import RowArrays, TrainingRows, screen_bas
 from reactorwatch.arrays import Array
 from reactorwatch.contract.messages_pb2 import Baseline
 from reactorwatch.diagnosis.estimates import extended_model
-from reactorwatch.diagnosis.result import AMBIGUOUS, NOMINAL, Cause, Diagnosis
 from reactorwatch.diagnosis.whiteness import minus_log10_p
 from reactorwatch.errors import InputError
 from reactorwatch.kalman.batch import GATE, LONGEST_GAP_MIN, FilterRecord, FilterResult
@@ -48,6 +47,7 @@ from reactorwatch.process.extended_model import ExtendedModel, extended_model_of
 from reactorwatch.process.model import MODEL_CACHE_SIZE, ProcessModel
 from reactorwatch.process.profiles import FREE_NAME
 from reactorwatch.records.record import GAP_ROWS, MINUTE_NS, Record
+from reactorwatch.sentences.diagnosis import describe_training
 
 DIAGNOSED = "diagnosed"
 """`Baseline.what` of a change after a diagnosis of the training."""
@@ -161,9 +161,9 @@ def _diagnose(record: Record, model: ProcessModel, uncertain: Uncertain) -> tupl
         return FAILED, f"not diagnosed: {error}", None
     lasting = [cause for cause in found.causes if cause.profile != FREE_NAME]
     if not lasting:
-        return found.verdict, _reason(found), None
+        return found.verdict, describe_training(found), None
     extended = extended_model(model, effects_of(model), lasting, record.zero_ns)
-    return found.verdict, _reason(found), parse_extended_model(_json(extended))
+    return found.verdict, describe_training(found), parse_extended_model(_json(extended))
 
 
 def equations_text(model: ProcessModel | None) -> str:
@@ -189,24 +189,6 @@ def read_equations(text: str) -> ProcessModel:
         return parse_extended_model(text).rebase(0).build()
     except InputError as error:
         raise InputError(f"the model of the baseline {error}") from error
-
-
-def _reason(found: Diagnosis) -> str:
-    if found.verdict == NOMINAL:
-        return "the training agrees with the equations"
-    if not found.causes:
-        return f"the training deviates from the equations ({found.location}), and no cause of the catalogue explains it"
-    text = f"the training deviates from the equations by {' and '.join(map(_text, found.causes))}"
-    others = [" and ".join(map(_text, item.explanation)) for item in found.alternatives]
-    return f"{text}; its rows do not rule out {', or '.join(others)}" if found.verdict == AMBIGUOUS else text
-
-
-def _text(cause: Cause) -> str:
-    size = cause.parameters["size"]
-    if cause.profile == FREE_NAME:
-        return f"{cause.label} ({cause.cause}) in the course of a curve, which predicts no other rows"
-    unit = "" if size.unit == "1" else f" {size.unit}"
-    return f"{cause.label} ({cause.cause}, {cause.profile}) of {size.value:+.3g}{unit}"
 
 
 def _json(extended: dict[str, Any]) -> str:

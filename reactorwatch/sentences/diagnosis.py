@@ -47,6 +47,32 @@ def describe_verdict(diagnosis: "Diagnosis") -> str:
     return f"{text} {matters}"
 
 
+def describe_training(diagnosis: "Diagnosis") -> str:
+    """Deviation of a plant's training from its equations, in a sentence."""
+    if diagnosis.verdict == "nominal":
+        return "the training agrees with the equations"
+    if not diagnosis.causes:
+        where = diagnosis.location
+        return f"the training deviates from the equations ({where}), and no cause of the catalogue explains it"
+    text = f"the training deviates from the equations by {_join_sizes(diagnosis.causes)}"
+    others = ", or ".join(_join_sizes(item.explanation) for item in diagnosis.alternatives)
+    return f"{text}; its rows do not rule out {others}" if diagnosis.verdict == "ambiguous" else text
+
+
+def _join_sizes(causes: Sequence["Cause"]) -> str:
+    """Causes with their sizes as numbers."""
+    texts = []
+    for cause in causes:
+        size = cause.parameters["size"]
+        unit = "" if size.unit == "1" else f" {size.unit}"
+        texts.append(
+            f"{cause.label} ({cause.cause}) in the course of a curve, which predicts no other rows"
+            if cause.profile == "free"
+            else f"{cause.label} ({cause.cause}, {cause.profile}) of {size.value:+.3g}{unit}"
+        )
+    return " and ".join(texts)
+
+
 def law_rows(law: "Law") -> list[tuple[str, str]]:
     """Facts about a law, each with its name."""
     unit = "" if law.unit == "1" else f", in {law.unit}"

@@ -45,7 +45,9 @@ def read_boot_clock() -> BootClock:
 
 
 class _FirstSeen(msgspec.Struct, frozen=True):
-    modified_ns: int  # a reused name with another modification time is another file
+    """A reused name with another modification time is another file."""
+
+    modified_ns: int
     seen_ns: int
 
 

@@ -16,15 +16,7 @@ import lz4.frame
 import zstandard
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import (
-    AttachmentIndex,
-    Channel,
-    Chunk,
-    ChunkIndex,
-    MetadataIndex,
-    Schema,
-    Statistics,
-)
+from mcap.records import Channel, Chunk, ChunkIndex, MetadataIndex, Schema, Statistics
 from mcap.stream_reader import StreamReader
 from mcap.summary import Summary
 from mcap.writer import MCAP0_MAGIC
@@ -85,30 +77,23 @@ def read_summary(path: Path, data: mmap.mmap) -> Summary:
     content = data[start:]
     if crc and zlib.crc32(content[: -len(MCAP0_MAGIC) - 4]) != crc:
         raise damage_error(path, "its index is damaged: the checksum differs")
-    try:
-        return _parse_summary(content)
-    except DAMAGE as error:
-        raise damage_error(path, "its index is damaged", error) from error
-
-
-def _parse_summary(content: bytes) -> Summary:
-    """Parse the records of an index and the footer after it; other kinds, such as chunks, are ignored."""
     summary = Summary()
     reader = StreamReader(io.BytesIO(content), skip_magic=True, emit_chunks=True, record_size_limit=len(content))
-    for record in reader.records:
-        match record:
-            case Schema():
-                summary.schemas[record.id] = record
-            case Channel():
-                summary.channels[record.id] = record
-            case ChunkIndex():
-                summary.chunk_indexes.append(record)
-            case MetadataIndex():
-                summary.metadata_indexes.append(record)
-            case AttachmentIndex():
-                summary.attachment_indexes.append(record)
-            case Statistics():
-                summary.statistics = record
+    try:
+        for record in reader.records:  # other kinds, such as chunks, are ignored
+            match record:
+                case Schema():
+                    summary.schemas[record.id] = record
+                case Channel():
+                    summary.channels[record.id] = record
+                case ChunkIndex():
+                    summary.chunk_indexes.append(record)
+                case MetadataIndex():
+                    summary.metadata_indexes.append(record)
+                case Statistics():
+                    summary.statistics = record
+    except DAMAGE as error:
+        raise damage_error(path, "its index is damaged", error) from error
     return summary
 
 

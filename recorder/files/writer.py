@@ -206,7 +206,12 @@ class RecordingWriter:
 
     def _register(self, channel: Channel) -> int:
         if isinstance(channel, StoredChannel):
-            return self._copy_channel(channel)
+            record, described = channel.record, channel.schema
+            number = self._schema(described.name, described.encoding, described.data) if described else 0
+            name = (record.topic, record.message_encoding, number, *sorted(record.metadata.items()))
+            if name not in self._copies:  # two readers have objects of their own for equal channels
+                self._copies[name] = self._add_channel(record.topic, record.message_encoding, number, record.metadata)
+            return self._copies[name]
         metadata = {LATCHED: "true"} if channel.latched else {}
         kind = message_type(channel.encoding) if channel.is_readable else None
         if kind is None:
@@ -223,14 +228,6 @@ class RecordingWriter:
         number = self._writer.register_channel(topic, encoding, schema, metadata)
         self._write_outside(ChannelRecord(number, topic, encoding, metadata, schema))
         return number
-
-    def _copy_channel(self, channel: StoredChannel) -> int:
-        record, schema = channel.record, channel.schema
-        number = self._schema(schema.name, schema.encoding, schema.data) if schema else 0
-        name = (record.topic, record.message_encoding, number, *sorted(record.metadata.items()))
-        if name not in self._copies:
-            self._copies[name] = self._add_channel(record.topic, record.message_encoding, number, record.metadata)
-        return self._copies[name]
 
     def _schema(self, name: str, encoding: str, data: bytes) -> int:
         described = (name, encoding, data)

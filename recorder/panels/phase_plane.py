@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.steady_state import SteadyState, steady_states
-from recorder.columns import RunColumns, Times, Values, find_model
+from recorder.columns import RunColumns, Times, Values
 from recorder.panels.base import (
     ALARM,
     FAULT,
@@ -27,9 +27,10 @@ from recorder.panels.base import (
     PlanePath,
     PlanePlot,
 )
+from recorder.panels.signals import find_model
 
 MAX_POINTS = 4000
-"""Largest number of points of a path in a segment; beyond it only extreme rows are drawn."""
+"""Largest number of points of a path in a segment, as many as a screen can show; beyond it extreme rows are drawn."""
 
 _ACTIVE = (messages.ALARM_STATE_UNACKNOWLEDGED, messages.ALARM_STATE_ACKNOWLEDGED)
 

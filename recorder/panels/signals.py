@@ -3,15 +3,21 @@
 The panel of models shows the parameters of the adaptive, frozen and reference model, noise levels, and excitation: the
 ratio of the smallest to the largest singular value of the scaled regressor. Where it is near 0, the estimated
 parameters are noise.
+
+Signals have meanings and roles from their process, or from the catalogue of processes.
 """
 
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from reactorwatch.contract import messages_pb2 as messages
+from reactorwatch.description.process import Process
+from reactorwatch.process import MODELS as PROCESS_MODELS
+from reactorwatch.process.model import ProcessModel
 from recorder.columns import (
     ADAPTIVE,
     EQUATIONS,
@@ -22,8 +28,6 @@ from recorder.columns import (
     RunColumns,
     Times,
     Values,
-    signal_roles,
-    signal_title,
     times_of,
 )
 from recorder.panels.base import (
@@ -47,6 +51,63 @@ from recorder.panels.base import (
 _ROLES = ("output", "setpoint", "input", "mode", "label")
 """Roles in the order of their plots."""
 _ROLE_COLOURS = {"setpoint": SETPOINT, "input": INPUT, "mode": QUIET, "label": QUIET}
+
+
+def signal_title(name: str, unit: str, process: Process | None = None) -> str:
+    """Name of a signal, with its meaning if its process has a variable of that name.
+
+    Without a process, it is any of the catalogue whose variable has this unit, too.
+    """
+    for model in _models_of(process):
+        for item in (*model.inputs, *model.states):
+            if item.name == name and (item.unit == unit or process is not None):
+                return f"{name}: {item.meaning}" if item.meaning else name
+    return name
+
+
+def signal_roles(units: Mapping[str, str], process: Process | None = None) -> dict[str, str]:
+    """Roles of signals by name: those of the process in its order, then all others as outputs.
+
+    Args:
+        units: units of the signals, by name; empty: unknown.
+        process: process of the signals; None: the one of the catalogue that has all of them, or all of whose signals
+            are there.
+    """
+    if process is not None:
+        roles = {signal.name: signal.role for signal in process.signals}
+    elif (model := find_model(units) or _find_model_with(units)) is not None:
+        roles = {name: "input" if name in model.input_names else "output" for name in model.units}
+    else:
+        roles = {}
+    known = {name: role for name, role in roles.items() if name in units}
+    return known | {name: "output" for name in units if name not in roles}
+
+
+def find_model(units: Mapping[str, str], process: Process | None = None) -> ProcessModel | None:
+    """Equations, of the catalogue without a process, whose inputs and outputs are all present with the same units."""
+    return next((model for model in _models_of(process) if model.units.items() <= units.items()), None)
+
+
+def _find_model_with(units: Mapping[str, str]) -> ProcessModel | None:
+    """Model of the catalogue that has all of the signals, none of them in another unit."""
+    for model in _models():
+        if all(name in model.units and unit in ("", model.units[name]) for name, unit in units.items()):
+            return model
+    return None
+
+
+def _models_of(process: Process | None) -> tuple[ProcessModel, ...]:
+    """Equations of a process; without its own, those of the catalogue under its name."""
+    if process is None:
+        return _models()
+    if process.model is not None:
+        return (process.model,)
+    return tuple(model for model in _models() if model.name == process.name)
+
+
+@cache
+def _models() -> tuple[ProcessModel, ...]:
+    return tuple(build() for build in PROCESS_MODELS)
 
 
 def draw_overview(run: RunColumns) -> tuple[View, ...]:

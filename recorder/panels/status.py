@@ -144,7 +144,9 @@ def draw_health(run: RunColumns) -> tuple[View, ...]:
         for node, reports in sorted(run.health.items())
     )
     lags = _health_lines(run, attrgetter("lag_ms"))
-    problems = _health_lines(run, _problems, held=True)
+    problems = _health_lines(
+        run, lambda item: item.lost + item.late + item.refused + item.duplicated + item.out_of_order, held=True
+    )
     return (
         StateLines("Node phases", lanes, _PHASES),
         TimePlot("Lag between receipt and the end of processing", "ms", lags),
@@ -152,13 +154,9 @@ def draw_health(run: RunColumns) -> tuple[View, ...]:
     )
 
 
-def _problems(report: messages.Health) -> float:
-    return float(report.lost + report.late + report.refused + report.duplicated + report.out_of_order)
-
-
 def _health_lines(run: RunColumns, of: Callable[[messages.Health], float], *, held: bool = False) -> tuple[Series, ...]:
     return tuple(
-        Series(node, times_of(reports), np.array([of(item) for item in reports]), colour, held=held)
+        Series(node, times_of(reports), np.array([of(item) for item in reports], np.float64), colour, held=held)
         for (node, reports), colour in zip(sorted(run.health.items()), cycle(SEVERAL), strict=False)
     )
 

@@ -19,7 +19,6 @@ from reactorwatch.records.file_format import GUESS, FileFormat
 from reactorwatch.records.record import LONGEST_MIN, MINUTE_NS, Record, join_files, join_runs, to_time_ns
 from reactorwatch.records.write import atomic_write, refuse_source, write_table
 from recorder import RecordedMessage
-from recorder.columns import signal_roles
 from recorder.files.recording import (
     CLOCK,
     NO_CLOCK,
@@ -31,6 +30,7 @@ from recorder.files.recording import (
     zero_from,
 )
 from recorder.files.writer import RecordingWriter
+from recorder.panels.signals import signal_roles
 from recorder.samples import RunSplitter, SampleSeries, decode_messages
 from recorder.tools.player import samples_of
 

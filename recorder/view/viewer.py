@@ -111,7 +111,9 @@ def show(
         _check_free(target.bind, port)
     # The viewer serves a page to every host that a request names, so a guard is in front of it.
     page, data = (free_port(), free_port()) if target.web else ports
-    arguments = ("--serve-web", "--web-viewer-port", str(page), *_origins(target, ports[0])) if target.web else ()
+    # an option for pages of other machines that may read the data; those of this machine always may
+    origins = () if target.bind in LOOPBACK else ("--cors-allow-origin", f"http://*:{ports[0]}")
+    arguments = ("--serve-web", "--web-viewer-port", str(page), *origins) if target.web else ()
     bind = LOOPBACK[0] if target.web else target.bind
     with contextlib.ExitStack() as stack:
         folder = stack.enter_context(tempfile.TemporaryDirectory())
@@ -182,11 +184,6 @@ def _reachable_address(address: str) -> str:
 
 def _in_url(address: str) -> str:
     return f"[{address}]" if ":" in address else address
-
-
-def _origins(target: DisplayTarget, page: int) -> tuple[str, ...]:
-    """Option for pages of other machines that may read the data; those of this machine always may."""
-    return () if target.bind in LOOPBACK else ("--cors-allow-origin", f"http://*:{page}")
 
 
 def _wait_for(process: subprocess.Popen[bytes], port: int, bind: str, target: DisplayTarget, log: Path) -> None:

@@ -103,12 +103,6 @@ def test_the_model_that_a_diagnosis_extended_judges_without_alarm(leaking: Recor
     assert not rw.backtest(leaking, found.extended, training_min=20.0, diagnose_training=False).alarms
 
 
-def test_identification_gives_its_fit_under_both_names(leaking: Record) -> None:
-    found = rw.identify(leaking, output="T", model="arx", order=2)
-    assert found.fit is found.fit_percent
-    assert found.fit.one_step > 80.0
-
-
 @pytest.mark.parametrize(
     ("call", "message"),
     [

@@ -75,20 +75,6 @@ def test_a_record_is_taken_with_its_process_by_all_functions(from_arrays: rw.Rec
             function(from_arrays)
 
 
-def test_a_monitor_that_is_fed_its_rows_raises_the_alarms_of_the_back_test(from_arrays: rw.Record) -> None:
-    shifted = {name: values.copy() for name, values in from_arrays.signals.items()}
-    shifted["y"][200:] += 1.0
-    record = rw.Record(time_min=from_arrays.time_min, signals=shifted, process=RIG)
-    result, changes = rw.backtest(record, training_rows=100, reference="black-box"), []
-    monitor = rw.Monitor(RIG, training_rows=100, reference="black-box")
-    for row, minute in enumerate(record.time_min.tolist()):
-        values = {name: float(values[row]) for name, values in record.signals.items()}
-        changes += monitor.update(minute, values)
-    raised = [(item.alarm, item.time_min) for item in changes if item.event == "raised"]
-    assert raised
-    assert raised == [(item.alarm, item.raised_min) for item in result.alarms]
-
-
 def test_a_recording_describes_the_process_of_its_record(from_arrays: rw.Record, tmp_path: Path) -> None:
     write_table(tmp_path / "rig.csv", from_arrays)
     (tmp_path / "rig.toml").write_text(

@@ -1,7 +1,9 @@
 """Results in a notebook: each shows itself as HTML, as a figure, as a frame and as a page."""
 
+import copy
 import csv
 import io
+import json
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Iterator
 from datetime import UTC, datetime, timedelta
@@ -48,6 +50,19 @@ def test_a_result_is_well_formed_html_without_markup_from_elsewhere(results: dic
     ET.fromstring(f"<div>{shown}</div>")
     assert "<1>" not in shown
     assert "<b>" in shown
+
+
+@pytest.mark.parametrize("name", ["backtest", "diagnosis", "identification"])
+def test_a_result_has_the_fields_of_its_json_as_attributes_and_survives_a_copy(
+    results: dict[str, Any], name: str
+) -> None:
+    result = results[name]
+    stated = json.loads(json.dumps(result.to_dict(), allow_nan=False))
+    assert len(stated) > 10
+    assert stated.keys() - {"differences"} <= set(dir(result))
+    for key, value in stated.items():
+        assert value is None or getattr(result, key) is not None
+    assert copy.copy(result).to_dict() == result.to_dict()
 
 
 @pytest.mark.parametrize("name", RESULTS)

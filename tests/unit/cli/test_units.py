@@ -30,9 +30,9 @@ from reactorwatch.records.record import Record
 from reactorwatch.records.write import write_table
 from reactorwatch.results.backtest import Backtest
 from reactorwatch.spc.charts.base import format_quantity
-from recorder.columns import find_model, read_run, signal_title
+from recorder.columns import read_run
 from recorder.files.recording import Recording
-from recorder.panels.signals import OVERVIEW
+from recorder.panels.signals import OVERVIEW, find_model, signal_title
 from recorder.tools.convert import import_csv, read_record
 from recorder.tools.player import samples_of
 from tests.tables import UNITS, read_csv

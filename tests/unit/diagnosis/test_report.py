@@ -1,16 +1,19 @@
 """The page of a diagnosis: self-contained, well-formed, its curves first."""
 
+import hashlib
 import re
 import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
 from functools import cache
 from html.parser import HTMLParser
+from pathlib import Path
 
 import casadi as ca
 import numpy as np
 import pytest
 from msgspec import structs
 
+from reactorwatch.api.shown import report_origin
 from reactorwatch.diagnosis.report import mathml
 from reactorwatch.diagnosis.report.equations import balances
 from reactorwatch.diagnosis.report.page import as_page
@@ -19,6 +22,7 @@ from reactorwatch.figures import Line, Panel, panel_svg
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.library.cstr import EFFECTS, cstr
 from reactorwatch.process.model import ProcessModel
+from reactorwatch.version import this_build
 from tests.unit.diagnosis.cases import ADJUSTED, CASES
 
 EMPTY = {"meta", "br", "hr", "img", "link", "input"}
@@ -280,3 +284,22 @@ def test_a_change_that_is_too_long_is_named_beside_what_was_there() -> None:
     assert changed[0].right.startswith(nominal[0].right)
     assert "changed as said above" in changed[0].right
     assert changed[1] == nominal[1]
+
+
+def test_the_origin_has_time_version_hash_of_the_file_and_chosen_settings(tmp_path: Path) -> None:
+    file = tmp_path / "a.csv"
+    file.write_bytes(b"time_min,qc\n")
+    origin = report_origin(file, {"process": "cstr", "plant": None, "tolerance": {"T": 0.5}})
+    assert origin["software"] == f"reactorwatch {this_build()}"
+    assert origin["SHA-256 of the file"] == hashlib.sha256(b"time_min,qc\n").hexdigest()
+    assert origin["settings"] == "process cstr, tolerance T=0.5"
+    assert origin["made"][:2] == "20"
+    assert origin["made"][-5] in "+-"
+    assert "SHA-256 of the file" not in report_origin(tmp_path, {})
+
+
+def test_the_page_shows_its_origin_as_text_if_it_is_stated() -> None:
+    arguments = (CASES["named"], cstr(), EFFECTS, "a.csv", "extended.json")
+    page = as_page(*arguments, origin={"file": "<a>.csv"})
+    assert '<tr><th>file</th><td class="any">&lt;a&gt;.csv</td></tr>' in page
+    assert "This report" not in as_page(*arguments)

@@ -16,8 +16,7 @@ from reactorwatch.diagnosis.fitting.profiles import Constant, Decay, FittedProfi
 from reactorwatch.diagnosis.fitting.signatures import solve_bounded
 from reactorwatch.diagnosis.result import NAMED
 from reactorwatch.diagnosis.run import Run
-from reactorwatch.diagnosis.search.dynamic_effects_screen import DynamicEffectsScreen
-from reactorwatch.diagnosis.search.pair_screen import PairScreen
+from reactorwatch.diagnosis.search.dynamic_and_pair_screens import DynamicEffectsScreen, PairScreen
 from reactorwatch.diagnosis.search.screen import DECAYS, Screen
 from reactorwatch.kalman.error_dynamics import ErrorDynamics
 from reactorwatch.process.effect import Effect

@@ -18,6 +18,7 @@ from reactorwatch.cli.processes import write_settings
 from reactorwatch.cli.up import diagnosis_settings
 from reactorwatch.errors import InputError
 from reactorwatch.limits import Limits
+from reactorwatch.records.record import MINUTE_NS
 from reactorwatch.runtime.config import (
     MAX_SPAN_S,
     PROTOCOLS,
@@ -31,7 +32,7 @@ from reactorwatch.runtime.config import (
     valid_choices,
 )
 from recorder.config import RecorderConfig, ReplayConfig
-from recorder.node import build_black_box
+from recorder.keep import BlackBox
 
 
 def settings_file(folder: Path, text: str) -> Path:
@@ -154,7 +155,7 @@ def test_any_value_of_any_setting_is_valid_or_one_line(key: tuple[str, str], val
         assert "Invalid enum value" not in refused
         return
     if isinstance(found, RecorderConfig):
-        build_black_box(found)
+        assert BlackBox(round(found.black_box_min * MINUTE_NS)).longest_ns >= 0
     if isinstance(found, PlantConfig):
         assert found.rows is None or found.rows > 0
 

@@ -1,21 +1,17 @@
-"""Size and shape of the code: product lines, rooms and floors of each package, moves between files for one sample.
+"""Moves between files of the project for one sample of a watched plant.
 
-    python benchmarks/house.py
+    python benchmarks/moves.py
 
-A room is a file or folder at the top level of a package; its floor is the longest chain of rooms below it. A move is a
-call or a return that leads from one file of the project to another. The sample is the last of a row of a watched plant:
-once of an ordinary row, once of the row that raises the first alarm of a leak; as a live monitor does it, with points
-published and causes searched, and as a back-test does it, without either.
+A move is a call or a return that leads from one file to another. The sample is the last of a row: once of an ordinary
+row, once of the row that raises the first alarm of a leak; as a live monitor does it, with points published and causes
+searched, and as a back-test does it, without either.
 """
 
-import subprocess
 import sys
-from graphlib import TopologicalSorter
 from pathlib import Path
 from types import FrameType
 from typing import Any
 
-import grimp
 import numpy as np
 
 from monitor_node.config import MonitorConfig
@@ -27,42 +23,8 @@ from reactorwatch.contract.messages_pb2 import Alarm
 from recorder.tools.player import samples_of
 
 ROOT = Path(__file__).parents[1]
-PACKAGES = ("reactorwatch", "plant_node", "monitor_node", "recorder", "diagnosis_node")
-SHAPED = ("reactorwatch", "reactorwatch.runtime", "reactorwatch.diagnosis", "monitor_node", "recorder")
-GENERATED = "_pb2.py"
 TRAINING_MIN, ONSET_MIN, SPAN_MIN = 20.0, 30.0, 60.0
 SIGNALS = 3
-
-
-def product_lines() -> dict[str, int]:
-    """Lines of Python in each package, without generated code; those that git knows of."""
-    listed = subprocess.run(["git", "ls-files", "*.py"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
-    lines = dict.fromkeys(PACKAGES, 0)
-    for name in listed.split():
-        package = name.partition("/")[0]
-        if package in lines and not name.endswith(GENERATED):
-            lines[package] += len((ROOT / name).read_text(encoding="utf-8").splitlines())
-    return lines
-
-
-def floors(graph: grimp.ImportGraph, package: str) -> tuple[int, int]:
-    """Numbers of rooms and of floors of a package."""
-    depth = package.count(".") + 2
-
-    def room(module: str) -> str:
-        return ".".join(module.split(".")[:depth])
-
-    below: dict[str, set[str]] = {}
-    for module in graph.modules:
-        if module.startswith(f"{package}.") and not module.endswith(".__main__"):  # a command imports what it runs
-            imported = {
-                room(name) for name in graph.find_modules_directly_imported_by(module) if name.startswith(package)
-            }
-            below.setdefault(room(module), set()).update(imported - {room(module), package})
-    floor: dict[str, int] = {}
-    for name in TopologicalSorter(below).static_order():
-        floor[name] = 1 + max((floor[other] for other in below.get(name, ())), default=0)
-    return len(floor), max(floor.values())
 
 
 class Walk:
@@ -117,14 +79,6 @@ def _count_moves_once(*, live: bool) -> tuple[int, int]:
 
 def main() -> None:
     """Print the table."""
-    lines = product_lines()
-    print(f"product lines without generated code      {sum(lines.values()):,}")
-    for package, count in lines.items():
-        print(f"  {package:<40}{count:,}")
-    graph = grimp.build_graph(*PACKAGES, exclude_type_checking_imports=True)
-    for package in SHAPED:
-        rooms, storeys = floors(graph, package)
-        print(f"{package:<42}{rooms} rooms on {storeys} floors")
     for live, how in ((True, "with points and causes"), (False, "without either")):
         ordinary, alarm = count_moves(live=live)
         print(f"moves between files {how}: {ordinary} for an ordinary sample, {alarm} for one with an alarm")
