@@ -226,11 +226,6 @@ class ChartAlarm:
         self._mask, self._reach = (1 << window) - 1, 1 - dead_band
         self.memory = AlarmMemory()
 
-    @property
-    def is_idle(self) -> bool:
-        """True if a point within the limits would change nothing."""
-        return not (self.memory.standing or self.memory.recent)
-
     def update(self, judgement: Judgement, unit: str = "", time_ns: int | None = None) -> AlarmChange | None:
         """Update the alarm's condition with a point of the chart.
 
@@ -357,4 +352,4 @@ class KpiCounter(Memory):
 
     def _chatters(self, alarm: str) -> bool:
         times = [item.time_ns for item in self.recent if item.alarm == alarm]
-        return any(last - first <= CHATTER_WITHIN_NS for first, last in zip(times, times[3 - 1 :], strict=False))
+        return any(last - first <= CHATTER_WITHIN_NS for first, last in zip(times, times[2:], strict=False))

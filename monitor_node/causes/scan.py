@@ -209,8 +209,7 @@ class Candidate:
         slope, span = self.parameters[0] / max(end_min - self.onset_min, 1e-9), last_min - self.onset_min
         trials = [
             replace(self, profile=EndedRamp, parameters=np.array([slope * age, self.onset_min, self.onset_min + age]))
-            # shares of the time since the onset after which a ramp may have ended
-            for age in (share * span for share in ((0.4, 0.6, 0.8, 0.95)))
+            for age in (share * span for share in (0.4, 0.6, 0.8, 0.95))
         ]
         going_on = replace(self, profile=Ramp, parameters=np.array([slope * span, self.onset_min]))
         return trials if self.profile is Ramp else [*trials, going_on]
