@@ -30,10 +30,9 @@ from recorder.core import ReceivedMessage, fingerprint
 from recorder.files.ages import Ages, BootClock, read_boot_clock
 from recorder.files.copies import Window, cut, delete_partial_copies, find_orphans, list_damaged, repair
 from recorder.files.index import span_ns
-from recorder.files.part_file import PART, PartFile
 from recorder.files.reader import Reader, Wanted, select_topics
 from recorder.files.recording import FILE_INDEX, GAP, PROCESS, gap_metadata, process_metadata
-from recorder.files.writer import RecordingWriter, check_free, part_of
+from recorder.files.writer import PART, PartFile, RecordingWriter, check_free, part_of
 from recorder.keep import (
     DAY_NS,
     ENDING,
