@@ -375,10 +375,11 @@ class ChannelBudget:
                 return False
             self._others.add(channel)
             return True
-        is_full = len(self._received_ns) + self._latched >= self._most_keys
-        if is_full and channel not in self._received_ns and channel.key not in self._reserved:
+        received_ns = self._received_ns
+        is_new = channel not in received_ns and channel.key not in self._reserved
+        if is_new and len(received_ns) + self._latched >= self._most_keys:
             return False
-        self._received_ns[channel] = now_ns
+        received_ns[channel] = now_ns
         return True
 
     def has(self, channel: Channel) -> bool:
