@@ -21,10 +21,8 @@ from reactorwatch.version import build_metadata
 from recorder import RecordedMessage
 from recorder.config import ReplayConfig
 from recorder.files.index import LATEST_NS
-from recorder.files.part_file import PART
 from recorder.files.reader import read_start
 from recorder.files.recording import (
-    METADATA,
     Recording,
     group_overlapping,
     has_clock,
@@ -33,7 +31,7 @@ from recorder.files.recording import (
     open_sources,
     zero_from,
 )
-from recorder.files.writer import RecordingWriter
+from recorder.files.writer import METADATA, PART, RecordingWriter
 from recorder.tools.convert import read_record
 from recorder.tools.inspect import inspect
 from recorder.tools.player import samples_of
