@@ -259,7 +259,6 @@ URGENCY = (
 )
 """States of alarms, the most urgent first; an incident has that of its most urgent alarm."""
 
-FLOOD = 10  # alarms in the window; more are a flood
 CHATTER_WITHIN_NS = MINUTE_NS
 
 
@@ -331,7 +330,7 @@ class KpiCounter(Memory):
         return AlarmKpis(
             time_ns=time_ns,
             alarms_10min=len(recent),
-            flood=len(recent) > FLOOD,
+            flood=len(recent) > 10,
             chattering=sorted({item.alarm for item in recent if self._chatters(item.alarm)}),
             standing=[alarm.name for alarm in active],
             stale=[alarm.name for alarm in active if time_ns - alarm.memory.raised_ns > 24 * 60 * MINUTE_NS],

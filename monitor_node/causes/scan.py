@@ -6,7 +6,7 @@ likeliest size is a / b, its variance 1 / b, and twice the logarithm of the like
 over the rows gives all onsets of all causes: 0.7 ms for 600 rows.
 
 The signature is that of an infinitesimal size. A large fault soon leads the plant out of its range, so there are two
-scans: of the rows up to the first at which some cause stands out by `STANDS_OUT`, and of all.
+scans: of the rows up to the first at which some cause stands out, and of all.
 """
 
 from collections.abc import Iterable, Sequence
@@ -28,9 +28,6 @@ from reactorwatch.kalman.error_dynamics import ErrorDynamics
 from reactorwatch.process.effect import Effect, SensorEffect
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.stored_state import Memory
-
-STANDS_OUT = 60.0
-"""Twice a logarithm of a likelihood ratio."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +51,7 @@ class Scan:
     @property
     def stands_out(self) -> bool:
         """True if the likelihood ratio of some cause is that of more than noise."""
-        return bool(np.max(self.ratio) > STANDS_OUT)
+        return bool(np.max(self.ratio) > 60.0)
 
 
 class GlrScan:
