@@ -11,8 +11,7 @@ from math import isinf
 from plant_node.config import PlantConfig
 from plant_node.core import FaultChange, Plant, Row
 from reactorwatch.contract import keys
-from reactorwatch.contract.codec import DecodeError, Encoded, Publication
-from reactorwatch.contract.commands import decode_command
+from reactorwatch.contract.codec import DecodeError, Encoded, Publication, decode_command
 from reactorwatch.contract.messages_pb2 import (
     ClearFault,
     CommandReply,
