@@ -26,9 +26,8 @@ from reactorwatch.runtime.node_main import configure_log
 from recorder import RecordedMessage
 from recorder.config import RecorderConfig
 from recorder.core import Recorder
-from recorder.files.part_file import PartFile
 from recorder.files.recording import Recording
-from recorder.files.writer import RecordingWriter
+from recorder.files.writer import PartFile, RecordingWriter
 from recorder.keep import Fsync
 from recorder.node import RecorderNode
 from recorder.recording_files import RecordingFiles

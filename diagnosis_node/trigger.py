@@ -25,7 +25,6 @@ from recorder import RecordedMessage
 
 HIDDEN_STATES = frozenset(CODES[state] for state in OUT_OF_SIGHT)  # alarms that trigger no diagnosis
 NO_DATA = "silence/"  # start of the names of alarms about missing data, which no model explains
-MAX_SAMPLES = 300_000  # at any sampling rate
 TIMEOUT_NS = 60 * 10**9  # time without a sample after which the plant is considered stopped
 
 
@@ -84,7 +83,7 @@ class DiagnosisTrigger(Node):
         busy: Callable[[], bool],
     ) -> None:
         self._config, self._diagnose, self._busy = config, diagnose, busy
-        self._samples: deque[RecordedMessage] = deque(maxlen=MAX_SAMPLES)
+        self._samples: deque[RecordedMessage] = deque(maxlen=300_000)  # at any sampling rate
         self.waiting: Alarm | None = None
         self._suppressed_until_ns = -NEVER_NS
         self._timeout_ns = NEVER_NS

@@ -39,8 +39,7 @@ from monitor_node.watch.promise import PromiseStage
 from monitor_node.watch.promise_check import check_training
 from monitor_node.watched_process import order_inputs
 from reactorwatch.contract import keys
-from reactorwatch.contract.codec import Body, DecodeError, Encoded, Publication, decode, encode
-from reactorwatch.contract.commands import decode_command
+from reactorwatch.contract.codec import Body, DecodeError, Encoded, Publication, decode, decode_command, encode
 from reactorwatch.contract.messages_pb2 import Baseline, BaselineCommand, CommandReply, Health, Promise, Sample
 from reactorwatch.errors import InputError
 from reactorwatch.process.model import ProcessModel

@@ -74,7 +74,7 @@ class MonitorNode(FleetMonitor):
         kinds: tuple[PlantKind, ...] | None = None,
     ) -> None:
         self._fleet, self.metrics = fleet, metrics
-        self.expression = plants_of(config, fleet)
+        self.expression = fleet.plants or f"{keys.ROOT}/{config.plant}"
         self.token = token or instance_token(config, fleet)
         self.preparation: Iterator[None] | None = None
         self.resumed = False
@@ -355,11 +355,6 @@ class MonitorNode(FleetMonitor):
         if self.evictions > self._evicted_logged:
             self._evicted_logged = self.evictions
             log.warning("unverified plants without messages were evicted", so_far=self.evictions)
-
-
-def plants_of(config: MonitorConfig, fleet: FleetConfig) -> str:
-    """Key expression of the plants of a fleet, or of the one plant of the monitor's settings."""
-    return fleet.plants or f"{keys.ROOT}/{config.plant}"
 
 
 def instance_token(config: MonitorConfig, fleet: FleetConfig) -> str:

@@ -62,7 +62,7 @@ class Claim:
             if is_local(path.parent):
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 return
-            token = secrets.token_hex(16 // 2).encode()
+            token = secrets.token_hex(8).encode()
             os.write(file, token)
             self._token = token
         except BlockingIOError:

@@ -19,8 +19,16 @@ from google.protobuf.message import Message
 from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.alarm_states import CODES, Event, State, next_state
-from reactorwatch.contract.codec import MAX_PAYLOAD, DecodeError, Encoded, Publication, decode, encoding_of
-from reactorwatch.contract.commands import check_signature, decode_command
+from reactorwatch.contract.codec import (
+    MAX_PAYLOAD,
+    DecodeError,
+    Encoded,
+    Publication,
+    check_signature,
+    decode,
+    decode_command,
+    encoding_of,
+)
 from reactorwatch.contract.messages_pb2 import AlarmCommand, CommandReply, ListAlarms
 from reactorwatch.errors import InputError
 from reactorwatch.records.record import MINUTE_NS

@@ -7,9 +7,9 @@ A recorder that is killed loses what it had not handed to the operating system, 
 that loses its power loses what was not synced. The sync period trades safety against disk load.
 
 Retention selects the oldest recordings for deletion until the others are within limits. Its times are confirmed times
-(see `files.ages`): setting a clock deletes nothing. The black box keeps an interval around each alarm, in times of
-receipt. An alarm that is raised before the current interval ends extends it, because both belong to one event. An
-interval has a largest length; the next alarm after it starts a new one.
+(see `Ages`): setting a clock deletes nothing. The black box keeps an interval around each alarm, in times of receipt.
+An alarm that is raised before the current interval ends extends it, because both belong to one event. An interval has a
+largest length; the next alarm after it starts a new one.
 
 MCAP numbers the channels of a file with 16 bits, and the index grows with each channel. So the number of keys in a file
 is bounded. Keys with messages of the product have nearly all channels. Other keys and encodings have a small share of
@@ -242,7 +242,7 @@ def select_deletions(
 
 
 MAX_MARGINS = 10
-"""Largest time from the first alarm to the end of an interval, in margins."""
+"""Largest time from the first alarm to the end of an interval, in margins: alarms may come without an end."""
 RAISED = "raised"
 """Event of an alarm that is raised."""
 
@@ -327,7 +327,7 @@ class BlackBox:
 MAX_CHANNELS = 65_535
 """Channels in a file: https://mcap.dev/spec#channel-op0x04"""
 MAX_OTHER_CHANNELS = 4000
-"""Channels in a file for messages that are not of the product."""
+"""Channels in a file for messages that are not of the product, out of those that `MAX_KEYS` leaves."""
 MAX_KEYS = 60_000
 """Keys of the product in a file, latched messages included; some channels of the format stay free."""
 
@@ -375,10 +375,11 @@ class ChannelBudget:
                 return False
             self._others.add(channel)
             return True
-        is_full = len(self._received_ns) + self._latched >= self._most_keys
-        if is_full and channel not in self._received_ns and channel.key not in self._reserved:
+        received_ns = self._received_ns
+        is_new = channel not in received_ns and channel.key not in self._reserved
+        if is_new and len(received_ns) + self._latched >= self._most_keys:
             return False
-        self._received_ns[channel] = now_ns
+        received_ns[channel] = now_ns
         return True
 
     def has(self, channel: Channel) -> bool:

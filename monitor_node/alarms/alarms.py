@@ -226,11 +226,6 @@ class ChartAlarm:
         self._mask, self._reach = (1 << window) - 1, 1 - dead_band
         self.memory = AlarmMemory()
 
-    @property
-    def is_idle(self) -> bool:
-        """True if a point within the limits would change nothing."""
-        return not (self.memory.standing or self.memory.recent)
-
     def update(self, judgement: Judgement, unit: str = "", time_ns: int | None = None) -> AlarmChange | None:
         """Update the alarm's condition with a point of the chart.
 
@@ -264,7 +259,6 @@ URGENCY = (
 )
 """States of alarms, the most urgent first; an incident has that of its most urgent alarm."""
 
-FLOOD = 10  # alarms in the window; more are a flood
 CHATTER_WITHIN_NS = MINUTE_NS
 
 
@@ -336,7 +330,7 @@ class KpiCounter(Memory):
         return AlarmKpis(
             time_ns=time_ns,
             alarms_10min=len(recent),
-            flood=len(recent) > FLOOD,
+            flood=len(recent) > 10,
             chattering=sorted({item.alarm for item in recent if self._chatters(item.alarm)}),
             standing=[alarm.name for alarm in active],
             stale=[alarm.name for alarm in active if time_ns - alarm.memory.raised_ns > 24 * 60 * MINUTE_NS],
@@ -357,4 +351,4 @@ class KpiCounter(Memory):
 
     def _chatters(self, alarm: str) -> bool:
         times = [item.time_ns for item in self.recent if item.alarm == alarm]
-        return any(last - first <= CHATTER_WITHIN_NS for first, last in zip(times, times[3 - 1 :], strict=False))
+        return any(last - first <= CHATTER_WITHIN_NS for first, last in zip(times, times[2:], strict=False))

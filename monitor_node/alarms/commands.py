@@ -14,8 +14,15 @@ from google.protobuf.message import Message
 
 from monitor_node.alarms.annunciator import Action, Annunciator
 from reactorwatch.contract.alarm_states import Event
-from reactorwatch.contract.codec import DecodeError, Encoded, Publication, decode
-from reactorwatch.contract.commands import MAX_NAME, check_signature, decode_command
+from reactorwatch.contract.codec import (
+    MAX_NAME,
+    DecodeError,
+    Encoded,
+    Publication,
+    check_signature,
+    decode,
+    decode_command,
+)
 from reactorwatch.contract.messages_pb2 import Alarm, AlarmCommand, CommandReply, ListAlarms, ShelveAlarm
 from reactorwatch.errors import InputError
 

@@ -367,10 +367,9 @@ class _Segment:
         if first:
             at_start = self.evaluate(candidate, start)
             if self.loss_without_fault - at_start.loss < 0.5 * candidate.gain:
-                trials = [
-                    self.evaluate(candidate, np.array([share * start[0], start[1]])) for share in ((0.5, 0.2, 0.08))
-                ]
-                start = min((at_start, *trials), key=lambda item: item.loss).parameters[0]
+                smaller = (np.array([share * start[0], start[1]]) for share in (0.5, 0.2, 0.08))
+                trials = [at_start, *(self.evaluate(candidate, parameters) for parameters in smaller)]
+                start = min(trials, key=lambda item: item.loss).parameters[0]
         fit = self._hypothesis(candidate).fit(self._run, (start,), steps, self._like_of(candidate))
         gain = self.loss_without_fault - fit.loss
         return replace(candidate, parameters=fit.parameters[0], gain=gain, w=np.nan_to_num(fit.w), fit=fit)

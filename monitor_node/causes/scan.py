@@ -6,7 +6,7 @@ likeliest size is a / b, its variance 1 / b, and twice the logarithm of the like
 over the rows gives all onsets of all causes: 0.7 ms for 600 rows.
 
 The signature is that of an infinitesimal size. A large fault soon leads the plant out of its range, so there are two
-scans: of the rows up to the first at which some cause stands out by `STANDS_OUT`, and of all.
+scans: of the rows up to the first at which some cause stands out, and of all.
 """
 
 from collections.abc import Iterable, Sequence
@@ -28,9 +28,6 @@ from reactorwatch.kalman.error_dynamics import ErrorDynamics
 from reactorwatch.process.effect import Effect, SensorEffect
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.stored_state import Memory
-
-STANDS_OUT = 60.0
-"""Twice a logarithm of a likelihood ratio."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +51,7 @@ class Scan:
     @property
     def stands_out(self) -> bool:
         """True if the likelihood ratio of some cause is that of more than noise."""
-        return bool(np.max(self.ratio) > STANDS_OUT)
+        return bool(np.max(self.ratio) > 60.0)
 
 
 class GlrScan:
@@ -209,8 +206,7 @@ class Candidate:
         slope, span = self.parameters[0] / max(end_min - self.onset_min, 1e-9), last_min - self.onset_min
         trials = [
             replace(self, profile=EndedRamp, parameters=np.array([slope * age, self.onset_min, self.onset_min + age]))
-            # shares of the time since the onset after which a ramp may have ended
-            for age in (share * span for share in ((0.4, 0.6, 0.8, 0.95)))
+            for age in (share * span for share in (0.4, 0.6, 0.8, 0.95))
         ]
         going_on = replace(self, profile=Ramp, parameters=np.array([slope * span, self.onset_min]))
         return trials if self.profile is Ramp else [*trials, going_on]

@@ -364,7 +364,7 @@ class ChartWatch:
         known = [size == size for size in e]  # NaN is not equal to itself
         seen, changes = _ChartRow(e, known, withheld, row.inputs, row.values), list[AlarmChange]()
         for charts in self._watched.values():
-            always = points or not all(alarm.is_idle for alarm in charts.alarms)
+            always = points or any(alarm.memory.standing or alarm.memory.recent for alarm in charts.alarms)
             for index, judgement in enumerate(charts.update(seen, always=always) or ()):
                 if judgement is None:
                     continue

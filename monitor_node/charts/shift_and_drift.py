@@ -100,7 +100,7 @@ class ShiftWatch:
         for _ in range(min(row.interval.missing, ONSETS)):
             self._tests.update(self._none)
         is_out = self._tests.update(z)
-        if not (is_out or points or any(not alarm.is_idle for alarm in self._alarms)):
+        if not (is_out or points or any(alarm.memory.standing or alarm.memory.recent for alarm in self._alarms)):
             return changes
         for i, alarm in enumerate(self._alarms):
             point = self._tests.point(i)

@@ -24,10 +24,6 @@ from reactorwatch.spc.charts.parameters import learn
 ROWS_A_PARAMETER = 10
 """Least number of rows per parameter of a fitted model."""
 
-MOST_LEVERAGE = 0.2
-"""Largest variance of a prediction due to an input's coefficient, in variances of the residual. Several inputs are
-often those of controllers, which leave their range with a fault: rows are judged as far as models are determined."""
-
 
 def fewest_rows(structure: Structure) -> int:
     """Least number of consecutive rows for a fitted model of a structure."""
@@ -144,7 +140,9 @@ def start_judging(models: ArxReference, rows: RowArrays) -> None:
     margin = 0.1 * (high - low)
     if inputs.shape[1] > 1:  # an input that did not move has no coefficient
         values = np.count_nonzero(np.isfinite(inputs), axis=0)
-        reach = np.where(high > low, np.nanstd(inputs, axis=0) * np.sqrt(MOST_LEVERAGE * values), np.inf)
+        # Several inputs are often those of controllers, which leave their range with a fault. So rows are judged as far
+        # as models are determined: to a variance of 0.2 of the residual's due to the coefficient of an input.
+        reach = np.where(high > low, np.nanstd(inputs, axis=0) * np.sqrt(0.2 * values), np.inf)
         margin = np.maximum(margin, reach - 0.5 * (high - low))
     memory = ArxMemory((low - margin).tolist(), (high + margin).tolist())
     if models.config.has_values_only:

@@ -87,6 +87,11 @@ class Reference(ABC):
     def typical_sd(self) -> list[float]:
         """Median standard deviation of each residual, in the outputs' units; 1 if unknown."""
 
+    @property
+    def filter(self) -> "FilterReference | None":
+        """The reference itself, if it is a filter whose rows the compiled step can take."""
+        return None
+
     # --- rows ------------------------------------------------------------------------------------------------
 
     @abstractmethod
@@ -151,6 +156,11 @@ class FilterReference(Reference):
         """See `Reference`."""
         sds: list[float] = self.memory.typical_sd
         return sds
+
+    @property
+    def filter(self) -> "FilterReference":
+        """See `Reference`."""
+        return self
 
     @property
     def last_inputs(self) -> tuple[float, ...]:

@@ -1,7 +1,7 @@
 """Training of one plant, row by row, until there are rows enough to learn its baseline from.
 
-A training with too much disturbance is refused and starts again. After `MOST_REFUSALS` the next is used in full: a
-plant that never rests is monitored as well.
+A training with too much disturbance is refused and starts again. The third is used in full: a plant that never rests
+is monitored as well.
 """
 
 from collections.abc import Sequence
@@ -18,12 +18,6 @@ from reactorwatch.errors import UnfitRecordError
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MINUTE_NS
 from reactorwatch.stored_state import Memory
-
-MOST_REFUSALS = 2
-"""Refused trainings after which the next is used in full."""
-
-TIMES_FEWEST = 2
-"""Times the fewest rows of a training that a part of it needs to judge the rest: with fewer it is too rough."""
 
 
 class TrainingMemory(Memory):
@@ -110,7 +104,7 @@ class Training:
     def finish(self, *, last_chance: bool | None = None) -> TrainingResult:
         """Learn from the rows, even if they are disturbed at the last chance: as given, or after some refusals."""
         rows, self.memory.rows = self.memory.rows, self._no_rows
-        is_last = self.memory.refusals >= MOST_REFUSALS if last_chance is None else last_chance
+        is_last = self.memory.refusals >= 2 if last_chance is None else last_chance
         self.trained_rows = len(rows.times)
         return learn_baseline(self._config, self._model, self._models, rows, last_chance=is_last)
 

@@ -273,7 +273,7 @@ def after_largest_moves(inputs: Array) -> NDArray[np.bool_]:
     moves = np.nan_to_num(np.abs(np.diff(used, axis=0))).max(axis=1)
     before = np.concatenate([np.zeros(ROWS_AFTER + 1), moves])[: len(inputs) + ROWS_AFTER - 1]
     recent = np.lib.stride_tricks.sliding_window_view(before, ROWS_AFTER).max(axis=1)
-    limit = np.quantile(recent, 1.0 - 0.1)
+    limit = np.quantile(recent, 0.9)
     moved = recent > limit
     return np.asarray(moved if moved.any() else (recent == limit) & (recent > 0.0))
 

@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from msgspec.structs import replace
@@ -20,16 +20,15 @@ from monitor_node.watched_process import load_process
 from reactorwatch.contract import keys
 from reactorwatch.contract.alarm_states import Event
 from reactorwatch.contract.codec import Encoded, Publication
-from reactorwatch.contract.messages_pb2 import Alarm, Incident
+from reactorwatch.contract.messages_pb2 import Alarm, Baseline, Incident
 from reactorwatch.contract.messages_pb2 import Promise as PromiseMessage
-from reactorwatch.contract.suspects import set_suspects
 from reactorwatch.errors import UnfitRecordError
 from reactorwatch.limits import parse_json
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import Record, format_utc, to_minutes
-from reactorwatch.results.alarms import RaisedAlarm
+from reactorwatch.results.alarms import raised_alarms
 from reactorwatch.results.backtest import Backtest, ChangedModel, LeftOut, NoiseLevels, WatchedSignals
-from reactorwatch.results.promise import state_promise, three_digits
+from reactorwatch.results.promise import Power, Promise, state_promise, three_digits
 
 RAISED, CLEARED = Event.RAISED.value, Event.CLEARED.value
 
@@ -182,8 +181,9 @@ def run(
     first_ns = first_ns or 0
     zero_ns = first_ns if zero_ns is None else zero_ns
     clock_zero_ns = None if facts.clock_shift_ns is None else zero_ns + facts.clock_shift_ns
-    obstacle, since_ns, promise = _describe_obstacle(monitor), monitor.memory.watching_since_ns, monitor.promise
-    elsewhere = trained is not None
+    obstacle, since_ns, elsewhere = _describe_obstacle(monitor), monitor.memory.watching_since_ns, trained is not None
+    expected, message = monitor.pipeline.baselines.expected_false_alarms, monitor.promise
+    promise, power = _promise_of_rows(message, expected)
     return Backtest(
         file=facts.file,
         watched=not obstacle,
@@ -193,13 +193,16 @@ def run(
         span_min=to_minutes(monitor.span_ns),
         runs=1 + monitor.intake.aligner.memory.counts.restarts,
         trained_until_min=0.0 if elsewhere else None if since_ns is None else to_minutes(since_ns, zero_ns),
-        expected_false_alarms=three_digits(monitor.pipeline.baselines.expected_false_alarms),
-        **_state_promise(promise, monitor.pipeline.baselines.expected_false_alarms),
+        expected_false_alarms=three_digits(expected),
+        promise=promise,
+        power=power,
         signals=_watched_signals(monitor.config, {**facts.still, **monitor.excluded_signals}),
-        **_state_reference(monitor, zero_ns),
-        alarms=_raised_alarms(alarms, incidents, zero_ns),
+        reference=monitor.pipeline.reference or monitor.pipeline.baselines.modes.reference or None,
+        noise_levels=_noise_levels(monitor),
+        baseline=_changed_model(monitor.baseline, zero_ns),
+        alarms=raised_alarms(alarms, incidents, zero_ns),
         training_rows=monitor.pipeline.training.trained_rows if trained is None else trained.rows,
-        can_keep_per_30_days=None if promise is None else promise.can_keep_per_30_days,
+        can_keep_per_30_days=None if message is None else message.can_keep_per_30_days,
         trained_elsewhere=elsewhere,
         notes=[*(trained.notes if trained is not None else ()), *monitor.notes],
         refused=dict(monitor.intake.rejects.by_reason),
@@ -213,18 +216,18 @@ def run(
     )
 
 
-def _state_promise(message: PromiseMessage | None, expected: float) -> dict[str, Any]:
-    """Fields `promise`, for the rows that were judged, and `power`.
+def _promise_of_rows(message: PromiseMessage | None, expected: float) -> tuple[Promise | None, list[Power]]:
+    """Promise for the rows that were judged, and power.
 
     Args:
         message: the promise at the end of the record; None: no row was judged.
         expected: false alarms promised in these rows.
     """
     promise, power = state_promise(message)
-    if promise is not None and message is not None:
-        upper = expected * message.expected_90 / message.expected
-        promise = replace(promise, expected=three_digits(expected), expected_90=three_digits(upper))
-    return {"promise": promise, "power": power}
+    if promise is None or message is None:
+        return None, power
+    upper = expected * message.expected_90 / message.expected
+    return replace(promise, expected=three_digits(expected), expected_90=three_digits(upper)), power
 
 
 def _watched_signals(config: MonitorConfig, left_out: Mapping[str, str]) -> WatchedSignals:
@@ -232,41 +235,16 @@ def _watched_signals(config: MonitorConfig, left_out: Mapping[str, str]) -> Watc
     return WatchedSignals(inputs, outputs, [LeftOut(name, why) for name, why in left_out.items()])
 
 
-def _state_reference(monitor: Monitor, zero_ns: int) -> dict[str, Any]:
-    """Fields `reference`, `noise_levels` and `baseline`."""
-    evaluated, change = monitor.pipeline.evaluation.reference, monitor.baseline
-    levels = None if evaluated is None else evaluated.noise_levels
-    return {
-        "reference": monitor.pipeline.reference or monitor.pipeline.baselines.modes.reference or None,
-        "noise_levels": None if levels is None else NoiseLevels(**levels),
-        "baseline": None
-        if change is None
-        else ChangedModel(change.what, to_minutes(change.time_ns, zero_ns), change.why, parse_json(change.model)),
-    }
+def _noise_levels(monitor: Monitor) -> NoiseLevels | None:
+    reference = monitor.pipeline.evaluation.reference
+    levels = None if reference is None else reference.noise_levels
+    return None if levels is None else NoiseLevels(**levels)
 
 
-def _raised_alarms(changes: Sequence[Alarm], incidents: Sequence[Incident], zero_ns: int) -> list[RaisedAlarm]:
-    """Each alarm as raised, with its newest suspects."""
-    alarms: list[tuple[Alarm, int | None]] = []
-    last: dict[str, int] = {}
-    newest = {message.number: message.suspects for message in incidents}
-    for message in changes:
-        if message.event == RAISED:
-            last[message.alarm] = len(alarms)
-            alarm = Alarm()
-            alarm.CopyFrom(message)
-            alarms.append((alarm, None))
-        elif message.alarm in last:
-            alarm, cleared_ns = alarms[last[message.alarm]]
-            if message.raised_ns == alarm.raised_ns and message.suspects:
-                set_suspects(alarm, message.suspects)
-            if cleared_ns is None and (message.cleared_ns or message.event == CLEARED):
-                cleared_ns = message.cleared_ns
-            alarms[last[message.alarm]] = (alarm, cleared_ns)
-    for alarm, cleared_ns in alarms:
-        if cleared_ns is None and not alarm.names_cause:
-            set_suspects(alarm, newest.get(alarm.incident, ()))
-    return [RaisedAlarm.of(alarm, cleared_ns, zero_ns) for alarm, cleared_ns in alarms]
+def _changed_model(change: Baseline | None, zero_ns: int) -> ChangedModel | None:
+    if change is None:
+        return None
+    return ChangedModel(change.what, to_minutes(change.time_ns, zero_ns), change.why, parse_json(change.model))
 
 
 def _publications(monitor: Monitor, messages: Iterable[Encoded]) -> Iterator[list[Publication]]:

@@ -23,7 +23,7 @@ from monitor_node.learn.training_diagnosis import FAILED, DiagnosisJob, Finding,
 from monitor_node.learn.training_rows import TrainingRows
 from monitor_node.watch.evaluation import Evaluation, EvaluationMemory
 from monitor_node.watch.operation import Operation
-from reactorwatch.contract.commands import check_signature
+from reactorwatch.contract.codec import check_signature
 from reactorwatch.contract.messages_pb2 import Baseline, BaselineCommand
 from reactorwatch.diagnosis.result import NOMINAL
 from reactorwatch.errors import InputError

@@ -36,9 +36,6 @@ HORIZONS_MIN = (10.0, 60.0, 1440.0)
 FIELDS = ("within_10_min", "within_1_h", "within_1_day")
 RAMP = "ramp"
 
-RUNS = 2
-"""Onsets of which a black box is run."""
-
 MOST_ROWS = 600
 """Rows after an onset that are computed; later ones are like their later half."""
 
@@ -174,7 +171,7 @@ def _biases(watch: Watch, arrays: RowArrays) -> list[Deviation]:
     """Biases of the outputs, by the difference that they make to normalised residuals."""
     reference, measured = watch.reference, arrays.outputs
     rows = min(MOST_ROWS, len(measured) // 2)
-    onsets = np.linspace(FEWEST_ROWS // 2, len(measured) - rows, RUNS).astype(int).tolist()
+    onsets = np.linspace(FEWEST_ROWS // 2, len(measured) - rows, 2).astype(int).tolist()
     usual, found = reference.normalised_residuals(arrays), []
     responses = reference.step_responses(rows) if usual is None else None
     for index, name in enumerate(watch.config.outputs):

@@ -89,13 +89,10 @@ class PlantPromise(Memory):
         """False alarms promised in a number of rows, on average."""
         return self.per_30_days * rows / self.rows_in_30_days
 
-    def upper_count(self, rows: int) -> float:
-        """Upper bound at 90 % of the false alarms of this plant in a number of rows."""
-        return self.upper_per_30_days * rows / self.rows_in_30_days
-
     def has_drifted(self, rows: int) -> bool:
         """True if more events raised alarms in a number of rows than chance explains, by all that is known."""
-        upper = max(self.check.excess * self.mean_count(rows), self.upper_count(rows))
+        by_training = self.upper_per_30_days * rows / self.rows_in_30_days
+        upper = max(self.check.excess * self.mean_count(rows), by_training)
         # one or two may be faults
         return self.events >= 3 and float(pdtrc(self.events - 1, upper)) < UNLIKELY
 

@@ -14,7 +14,6 @@ import msgspec
 from monitor_node.alarms.annunciator import Annunciator
 from monitor_node.config import LARGEST_FALSE_ALARMS, MonitorConfig
 from monitor_node.ingest.rows import Row
-from monitor_node.learn.training import TIMES_FEWEST
 from monitor_node.learn.training_rows import TrainingRows
 from monitor_node.watch.pipeline import PlantPipeline
 from monitor_node.watch.promise import (
@@ -74,7 +73,7 @@ def check_training(
     for row in aligned[:half]:
         learner.update(row, units, [])
     try:
-        trained = learner.training.finish_early(times=TIMES_FEWEST)
+        trained = learner.training.finish_early(times=2)  # with fewer rows it is too rough to judge the rest
         memory, learned = copy_of(learner.memory), copy_of(trained.reference.memory)
 
         def start(config: MonitorConfig) -> PlantPipeline:

@@ -259,16 +259,16 @@ class OrdinaryRows:
     def start(self, reference: Reference) -> None:
         """Make the step of a reference, if there is one."""
         self.stop()
-        if not (isinstance(reference, FilterReference) and has_step(self._config)):
+        if reference.filter is None or not has_step(self._config):
             return
-        row_filter = reference.row_filter(self._config.inputs, self._config.outputs)
+        row_filter = reference.filter.row_filter(self._config.inputs, self._config.outputs)
         if row_filter is None:
             return
-        self.reference, self._code = reference, row_filter.code  # the object owns the machine code
+        self.reference, self._code = reference.filter, row_filter.code  # the object owns the machine code
         constants = self._settings[0]["constants"]
         constants["filter_address"] = 0 if row_filter.code is None else row_filter.code.address
         constants["spacing_min"] = row_filter.spacing_min
-        belief, variances = reference.numbers
+        belief, variances = reference.filter.numbers
         parameters = np.concatenate([row_filter.parameters, np.empty(variances.size)])
         self._filter = belief, variances, parameters, np.empty(belief.size)
 

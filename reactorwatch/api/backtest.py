@@ -17,7 +17,7 @@ from reactorwatch.optional import frame_of_rows
 from reactorwatch.records.record import Record
 from reactorwatch.results.alarms import RaisedAlarm
 from reactorwatch.results.backtest import Backtest
-from reactorwatch.sentences.backtest import backtest_headline, backtest_text
+from reactorwatch.sentences.backtest import backtest_headline, backtest_text, exclusion_sentences, training_sentence
 from recorder.tools.player import samples_of
 
 if TYPE_CHECKING:
@@ -51,17 +51,12 @@ class BacktestResult(Shown[Backtest]):
         for alarm, cause in zip(self.alarms, _new_causes(self.alarms), strict=True):
             cleared = "" if alarm.cleared_min is None else f"{alarm.cleared_min:g}"
             rows.append((f"{alarm.raised_min:g}", cleared, alarm.alarm, alarm.priority, cause))
-        trained = self.trained_until_min
         parts = [
             *map(html.headline, self.headline),
-            html.sentence(
-                f"Nothing was watched: {self.why}."
-                if trained is None
-                else f"Trained until {trained:g} min; {self.expected_false_alarms:.2g} false alarms are expected later."
-            ),
+            html.sentence(training_sentence(self.result)),
             html.table(("raised, min", "cleared, min", "alarm", "priority", "likely cause"), rows),
+            *map(html.sentence, exclusion_sentences(self.result)),
         ]
-        parts += [html.sentence(f"{item.signal} is not watched: {item.why}") for item in self.result.signals.left_out]
         return "".join(parts)
 
     def to_frame(self) -> "DataFrame":

@@ -15,6 +15,7 @@ from reactorwatch.identification.identify import Identification, ModelForm
 from reactorwatch.identification.identify import identify as fit_model
 from reactorwatch.optional import make_frame
 from reactorwatch.records.record import Record
+from reactorwatch.sentences.models import identification_headline
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -27,13 +28,9 @@ class IdentificationResult(Shown[Identification]):
         return f"<{self.model} of order {self.order} for {self.output}: free run {self.fit.free_run:.2f} %>"
 
     def _repr_html_(self) -> str:
-        fit = self.fit_percent
         return "".join(
             [
-                html.headline(
-                    f"{self.model} of order {self.order}, delay {self.delay}, for {self.output}: "
-                    f"free run {fit.free_run:.2f} %, one step {fit.one_step:.2f} %"
-                ),
+                html.headline(identification_headline(self.result)),
                 html.sentence(f"{self.rows} rows were fitted; the fits are of rows that were not."),
                 html.table(("check", "result"), self.checks.items()),
             ]

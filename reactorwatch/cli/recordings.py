@@ -242,7 +242,7 @@ def recover(
     """Recover the intact messages of a damaged recording."""
     from reactorwatch.cli.info import saved_object, saved_text
     from recorder.files.copies import recover as save
-    from recorder.files.part_file import is_locked
+    from recorder.files.writer import is_locked
 
     if is_locked(check_input(file)):
         raise InputError(f"{file}: is still being written; stop its recorder first")

@@ -7,7 +7,7 @@ input changes. So the parameter is scanned about the best fit with the others fi
 distribution (Sivia & Skilling 2006, Data Analysis: A Bayesian Tutorial, 2.2). The mean is the estimate if it is about
 as likely as the maximum; the root mean square distance from the estimate is the standard deviation.
 
-Effects with internal states were screened at a few magnitudes only (`dynamic_effects_screen`). For their steps all
+Effects with internal states were screened at a few magnitudes only (`dynamic_and_pair_screens`). For their steps all
 onsets are evaluated at once: the states are fast, so before the onset the innovations are those of a filter without the
 effect, and after it those of one with the effect throughout.
 

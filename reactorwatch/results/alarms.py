@@ -1,9 +1,12 @@
 """Alarms and suspects of results."""
 
+from collections.abc import Sequence
 from typing import ClassVar, Self
 
 from reactorwatch.contract import messages_pb2 as messages
+from reactorwatch.contract.alarm_states import Event
 from reactorwatch.contract.messages_pb2 import Alarm
+from reactorwatch.contract.suspects import set_suspects
 from reactorwatch.records.record import to_minutes
 from reactorwatch.results.base import Result
 from reactorwatch.sentences.alarm import describe_suspect, priority_word
@@ -84,3 +87,33 @@ class RaisedAlarm(Result, frozen=True):
             message=message,
             cleared_ns=cleared_ns,
         )
+
+
+def raised_alarms(changes: Sequence[Alarm], incidents: Sequence[messages.Incident], zero_ns: int) -> list[RaisedAlarm]:
+    """Each alarm as raised, with its newest suspects.
+
+    Args:
+        changes: every change of an alarm, in order.
+        incidents: every change of an incident, in order.
+        zero_ns: time from which minutes are counted.
+    """
+    alarms: list[tuple[Alarm, int | None]] = []
+    last: dict[str, int] = {}
+    newest = {message.number: message.suspects for message in incidents}
+    for message in changes:
+        if message.event == Event.RAISED:
+            last[message.alarm] = len(alarms)
+            alarm = Alarm()
+            alarm.CopyFrom(message)
+            alarms.append((alarm, None))
+        elif message.alarm in last:
+            alarm, cleared_ns = alarms[last[message.alarm]]
+            if message.raised_ns == alarm.raised_ns and message.suspects:
+                set_suspects(alarm, message.suspects)
+            if cleared_ns is None and (message.cleared_ns or message.event == Event.CLEARED):
+                cleared_ns = message.cleared_ns
+            alarms[last[message.alarm]] = (alarm, cleared_ns)
+    for alarm, cleared_ns in alarms:
+        if cleared_ns is None and not alarm.names_cause:
+            set_suspects(alarm, newest.get(alarm.incident, ()))
+    return [RaisedAlarm.of(alarm, cleared_ns, zero_ns) for alarm, cleared_ns in alarms]

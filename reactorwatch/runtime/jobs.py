@@ -292,7 +292,6 @@ def choose_executor(processes: int | None = None, scheduler: str | None = None) 
     if scheduler is not None:
         if processes is not None:
             raise InputError("--jobs is for this machine, and --scheduler for a cluster; give one of them")
-
         return DaskExecutor(scheduler)
     if processes is None:
         processes = available_cores()

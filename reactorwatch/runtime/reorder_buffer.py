@@ -45,8 +45,6 @@ a second message: garbage makes one stream a message."""
 MAX_HELD = 1_000_000
 MAX_HELD_BYTES = 256 << 20
 """Messages of a stream that may be held, and their payload; beyond either, missing messages are given up."""
-MAX_LOST_RANGES = 100_000
-"""Ranges of lost numbers of a stream that are remembered, so that a message in one can still be released."""
 MAX_KEYS = 1000
 """Keys of a stream that are tracked."""
 
@@ -100,7 +98,7 @@ class HoldState(Generic[Item]):
 class StreamState(GapTracker, Generic[Item]):
     """Position in a stream; its gaps are given up, and a message in one is released at once."""
 
-    max_gaps = MAX_LOST_RANGES
+    max_gaps = 100_000
 
     publisher: int
     stream: str

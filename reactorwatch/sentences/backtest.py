@@ -27,11 +27,24 @@ def backtest_headline(result: "Backtest") -> list[str]:
     return headline(result.alarms, result.zero_ns, result.clock_zero_ns, doubt)
 
 
+def exclusion_sentences(result: "Backtest") -> list[str]:
+    """Signals that are not watched, with the reason."""
+    return [f"{item.signal} is not watched: {item.why}" for item in result.signals.left_out]
+
+
+def training_sentence(result: "Backtest") -> str:
+    """End of the training, and the false alarms that are expected after it."""
+    trained_min, expected = result.trained_until_min, result.expected_false_alarms
+    if trained_min is None:
+        return f"Nothing was watched: {result.why}."
+    return f"Trained until {trained_min:g} min; {expected:.2g} false alarms are expected later."
+
+
 def backtest_text(result: "Backtest") -> str:
     """Lines for a terminal: record, headline, training, promise, sensitivity, alarms and notes."""
     since = "" if result.clock_zero_ns is None else f", minutes since {format_utc(result.clock_zero_ns)}"
     lines = [f"{result.file}: {result.samples} rows over {result.span_min:g} min{since}", *backtest_headline(result)]
-    lines += [f"  {item.signal} is not watched: {item.why}" for item in result.signals.left_out]
+    lines += [f"  {sentence}" for sentence in exclusion_sentences(result)]
     if result.runs > 1:
         lines.append(
             f"the plant's clock steps back, or the plant was restarted: {result.runs} runs, watched one by one"

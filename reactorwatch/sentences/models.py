@@ -17,6 +17,15 @@ NAMES = {
 }
 
 
+def identification_headline(found: "Identification") -> str:
+    """Model and fits in a line."""
+    fit = found.fit_percent
+    return (
+        f"{found.model} of order {found.order}, delay {found.delay}, for {found.output}: "
+        f"free run {fit.free_run:.2f} %, one step {fit.one_step:.2f} %"
+    )
+
+
 def identification_text(
     found: "Identification", inputs: Sequence[str], unit: str, validated_on: str | None = None
 ) -> str:

@@ -20,10 +20,9 @@ from reactorwatch.errors import InputError
 from reactorwatch.records.write import atomic_write, refuse_source
 from recorder import RecordedMessage, StoredMessage
 from recorder.files.index import LATEST_NS
-from recorder.files.part_file import PART, is_locked, lock_orphan
 from recorder.files.reader import Damage, Reader, read_start, select_topics
-from recorder.files.recording import METADATA, SourceFile, merge_messages, open_sources, own_metadata, parse_gap
-from recorder.files.writer import RecordingWriter
+from recorder.files.recording import SourceFile, merge_messages, open_sources, own_metadata, parse_gap
+from recorder.files.writer import METADATA, PART, RecordingWriter, is_locked, lock_orphan
 from recorder.keep import LATCHED_KINDS, FileNames, LatchedMessages
 from recorder.samples import content_of
 

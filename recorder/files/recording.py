@@ -43,11 +43,9 @@ from reactorwatch.records.record import Record
 from reactorwatch.runtime.reorder_buffer import Gap
 from recorder import RecordedMessage, StoredMessage
 from recorder.files.index import LATEST_NS, span_ns
-from recorder.files.part_file import PART, is_locked
 from recorder.files.reader import Reader, Wanted, metadata_records, select_topics
+from recorder.files.writer import METADATA, PART, is_locked
 
-METADATA = "reactorwatch"
-"""Name of the record that a writer of this software starts a file with."""
 FILE_INDEX = "file"
 """Key in it: index of the file within its run, from 1, if a recorder wrote it."""
 PROCESS = "reactorwatch.process"

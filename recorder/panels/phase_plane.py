@@ -30,7 +30,7 @@ from recorder.panels.base import (
 from recorder.panels.signals import find_model
 
 MAX_POINTS = 4000
-"""Largest number of points of a path in a segment; beyond it only extreme rows are drawn."""
+"""Largest number of points of a path in a segment, as many as a screen can show; beyond it extreme rows are drawn."""
 
 _ACTIVE = (messages.ALARM_STATE_UNACKNOWLEDGED, messages.ALARM_STATE_ACKNOWLEDGED)
 

@@ -16,7 +16,7 @@ from recorder.files.recording import Recording, gaps_of, own_metadata, processes
 from recorder.samples import Run, RunSplitter, content_of
 
 MAX_GAPS = 1000
-"""Gaps that are listed; more are counted only."""
+"""Gaps that are listed, more than is read; the others are counted."""
 
 
 @dataclass

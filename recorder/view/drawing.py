@@ -43,7 +43,7 @@ APPLICATION = "reactorwatch"
 RUN_TIME = "run time"
 SAMPLE_TIME = "sample time"
 BATCH_ROWS = 8192
-"""Points of a line that are sent at once."""
+"""Points of a line that are sent at once, which bounds the memory of a message to Rerun."""
 
 _ENDLESS = rr.TimeRangeBoundary.infinite()
 _WHOLE_RUN = rr.TimeRange(start=_ENDLESS, end=_ENDLESS)

@@ -5,7 +5,7 @@ alternatives have to explain the same data instead of it. About a good fit the l
 noise hides what separates the alternatives. About the nominal model that noise has absorbed the deviation, and only
 causes that stand out are found.
 
-Effects with internal states, such as a lag, have no infinitesimal deviation; see `dynamic_effects_screen`.
+Effects with internal states, such as a lag, have no infinitesimal deviation; see `dynamic_and_pair_screens`.
 
 Effects with other values of their own constants, so that a screen sees what those values do. A screen is linear about
 the nominal constants, and a side reaction with twice the heat does something else. So an effect is also screened at the

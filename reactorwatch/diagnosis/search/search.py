@@ -24,7 +24,7 @@ from reactorwatch.diagnosis.fitting.profiles import LateSine, PiecewiseLinear, S
 from reactorwatch.diagnosis.fitting.refinement import GRID, refine_onset, select_knots
 from reactorwatch.diagnosis.fitting.refinement import fit_hypothesis as scan_and_fit
 from reactorwatch.diagnosis.run import Run
-from reactorwatch.diagnosis.search.dynamic_effects_screen import DynamicEffectsScreen
+from reactorwatch.diagnosis.search.dynamic_and_pair_screens import DynamicEffectsScreen
 from reactorwatch.diagnosis.search.screen import Candidate, Part, Screen, first_of_each
 from reactorwatch.kalman.noise_estimation import resolution_sd
 from reactorwatch.process.effect import Effect

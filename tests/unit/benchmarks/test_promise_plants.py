@@ -12,7 +12,7 @@ from benchmarks.harness import plants
 from benchmarks.harness.plants import FLOWS, INPUTS, KINDS, Kind, simulate
 from benchmarks.harness.study import Pool, median_interval, poisson_interval, share_interval
 from benchmarks.promise import black_box
-from benchmarks.promise.__main__ import Outcome, Plant, print_counts, print_delays
+from benchmarks.promise.not_quite import Outcome, Plant, print_counts, print_delays
 from plant_node.record import simulate_record
 from reactorwatch.process.library.cstr import cstr
 from reactorwatch.process.simulate import Simulator

@@ -1,6 +1,8 @@
 """The study draws every figure of the report, prints its results with known numbers, and is reproducible."""
 
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -108,8 +110,10 @@ def test_the_same_seed_gives_the_same_bytes_and_another_gives_others(tmp_path: P
 
 @pytest.mark.slow
 def test_figures_drawn_at_the_same_time_are_those_drawn_one_after_the_other(tmp_path: Path) -> None:
-    for folder, processes in (("one", 1), ("two", 2)):
-        reproduce(tmp_path / folder, 3, "3,8,21-27", processes=processes)
+    """By the command, as `make reproduce` runs it."""
+    reproduce(tmp_path / "one", 3, "3,8,21-27")
+    command = [sys.executable, "-m", "benchmarks.study_figures", "--out", str(tmp_path / "two"), "--seed", "3"]
+    subprocess.run([*command, "--only", "3,8,21-27", "--jobs", "2"], check=True, cwd=DOCS.parent)
     names = ["study.md", *(f"study/figure-{number}.png" for number in ("03", "08", "21-27"))]
     assert [(tmp_path / "one" / name).read_bytes() == (tmp_path / "two" / name).read_bytes() for name in names] == (
         [True] * 4

@@ -22,11 +22,11 @@ from reactorwatch.kalman.error_dynamics import ErrorLinearization
 from reactorwatch.process import effects_of
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.extended_model import parse_extended_model
-from reactorwatch.process.library.cstr import EFFECTS, cstr
+from reactorwatch.process.library.cstr import cstr
 from reactorwatch.records.record import Record, join_runs
 from reactorwatch.sentences.diagnosis import diagnosis_text
 from tests.tables import read_csv
-from tests.unit.diagnosis.linear_tank import NOISE_SD, PERIOD_MIN, Shift, follows, tank
+from tests.unit.diagnosis.linear_tank import Shift, tank, tank_record
 from tests.unit.diagnosis.runs import record_of
 from tests.unit.process.effect_named import effect_of
 
@@ -253,21 +253,6 @@ def test_an_input_is_not_carried_over_from_one_run_to_the_next() -> None:
         make_run(record, cstr())
 
 
-LEVELS = np.repeat([4.0, 7.0, 3.0, 6.0, 2.0, 8.0, 5.0, 4.0, 6.0, 3.0], 60)
-
-
-def tank_record(gain: float) -> Record:
-    """Level of a tank whose input has another gain."""
-    level = follows(gain * LEVELS, gain * LEVELS[0])
-    noise = NOISE_SD * np.random.default_rng(1).standard_normal(level.size)
-    return Record(PERIOD_MIN * np.arange(level.size, dtype=np.float64), {"u": LEVELS, "h": level + noise}, "tank")
-
-
-def select(*names: str) -> tuple[Effect, ...]:
-    """Effects of the reactor with these names."""
-    return tuple(effect for effect in EFFECTS if effect.name in names)
-
-
 @pytest.mark.parametrize(
     ("effects", "gain", "verdict"),
     [
@@ -287,7 +272,7 @@ def test_a_model_of_ones_own_is_diagnosed_with_whatever_catalogue(
     effects: Sequence[Effect] | None, gain: float, verdict: str
 ) -> None:
     model = tank()
-    found = diagnose(tank_record(gain), model, effects)
+    found = diagnose(tank_record(gain=gain), model, effects)
     named = effects_of(model) if effects is None else effects
     assert (found.verdict, bool(found.causes)) == (verdict, verdict in (NAMED, AMBIGUOUS))
     assert found.significant == found.practical == (verdict != NOMINAL)
@@ -308,7 +293,7 @@ def test_a_model_of_ones_own_is_diagnosed_with_whatever_catalogue(
 )
 def test_what_a_small_catalogue_does_not_explain_is_unknown(names: tuple[str, ...]) -> None:
     record = record_of("coolant_flow:step:-0.05@30min", "temperature_bias:step:2@20min", rows=450)
-    found = diagnose(record, cstr(), select(*names))
+    found = diagnose(record, cstr(), [effect_of(name) for name in names])
     assert (found.verdict, found.causes) == (UNKNOWN, ())
     assert found.location
 

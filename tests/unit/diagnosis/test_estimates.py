@@ -22,6 +22,7 @@ from tests.hidden_effect.catalogue import named
 from tests.hidden_effect.draw import draw
 from tests.hidden_effect.excitation import NAMED_CIRCUMSTANCES
 from tests.unit.diagnosis.runs import make_run, record_of
+from tests.unit.process.effect_named import effect_of
 
 PERIOD_MIN = 0.1
 
@@ -30,7 +31,7 @@ def step_of(cause: str, size: float, onset_min: float, begun_min: float) -> tupl
     """Onset and size of a step in a plant, fitted from another onset; and the onset's standard deviation by the fit."""
     run = make_run(f"{cause}:step:{size}@{onset_min}min", rows=600)
     search = Search(cstr(), EFFECTS, run, (1e-4, 1e-2))
-    effect = next(item for item in EFFECTS if item.name == cause)
+    effect = effect_of(cause)
     hypothesis = Hypothesis(search.filter((effect,)), (Step(run.time_min),))
     fitted = search.fit(hypothesis, (np.array([size, begun_min]),))
     search.update_noise(fitted)

@@ -22,15 +22,7 @@ from reactorwatch.process.library.three_tanks import three_tanks
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.simulate import Simulator
 from reactorwatch.records.record import Record
-from tests.unit.diagnosis.linear_tank import NOISE_SD, PERIOD_MIN, follows, tank
-
-LEVELS = np.repeat([4.0, 7.0, 3.0, 6.0, 2.0, 8.0, 5.0, 4.0, 6.0, 3.0], 60)
-
-
-def tank_record(noise_sd: float, gain: float = 1.0) -> Record:
-    noise = noise_sd * np.random.default_rng(1).standard_normal(LEVELS.size)
-    time_min = PERIOD_MIN * np.arange(LEVELS.size, dtype=np.float64)
-    return Record(time_min, {"u": LEVELS, "h": follows(gain * LEVELS, gain * LEVELS[0]) + noise}, "tank")
+from tests.unit.diagnosis.linear_tank import NOISE_SD, tank, tank_record
 
 
 def of_tank(noise_sd: float) -> Identifiability:

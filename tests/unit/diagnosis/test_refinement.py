@@ -21,6 +21,7 @@ from reactorwatch.diagnosis.run import Run
 from reactorwatch.diagnosis.search.search import FittedHypothesis, Search
 from reactorwatch.process.library.cstr import EFFECTS, cstr
 from tests.unit.diagnosis.runs import make_run
+from tests.unit.process.effect_named import effect_of
 
 TIMES: Array = np.cumsum(np.append(0.0, np.random.default_rng(3).choice([0.05, 0.1, 0.2], 100)))
 
@@ -46,7 +47,7 @@ def test_what_grows_slowly_is_as_large_as_it_is(kind: type[FittedProfile], param
 def test_an_onset_that_no_slope_leads_to_is_found_from_another_stretch_between_two_moves(start_min: float) -> None:
     """The input moves every minute, and the sensors tell each stretch from the next."""
     run = make_run("sample_timing:step:0.06@40.53min", rows=900)
-    timing = next(effect for effect in EFFECTS if effect.name == "sample_timing")
+    timing = effect_of("sample_timing")
     hypothesis = Hypothesis(FaultFilter(cstr(), (timing,), Noise((0.002, 0.3), (0.0, 0.0))), (Step(run.time_min),))
     truth = hypothesis.evaluate(run, (np.array([0.06, 40.53]),))
     best = refine_onset(run, hypothesis, hypothesis.fit(run, (np.array([0.05, start_min]),)), MOST_STEPS)
@@ -54,7 +55,7 @@ def test_an_onset_that_no_slope_leads_to_is_found_from_another_stretch_between_t
     assert best.parameters[0][1] == pytest.approx(40.53, abs=1.0)
 
 
-STICKS = next(effect for effect in EFFECTS if effect.name == "valve_stiction")
+STICKS = effect_of("valve_stiction")
 NOISE = Noise((0.002, 0.3), (0.0, 0.0))
 
 
@@ -96,7 +97,7 @@ LAST_MIN = 149.9
 
 
 def curve(search: Search, cause: str, knots: int) -> FittedHypothesis:
-    effect = next(item for item in EFFECTS if item.name == cause)
+    effect = effect_of(cause)
     profile = PiecewiseLinear(search.run.time_min, knots)
     hypothesis = Hypothesis(search.filter((effect,)), (profile,))
     return search.fit(hypothesis, (np.full(knots, 0.1 * effect.typical),))
@@ -133,7 +134,7 @@ def test_no_knot_is_added_or_taken_away_at_a_loss() -> None:
 
 
 SENSORS = Noise((0.002, 0.3), (0.0, 0.0))
-DELAY = next(effect for effect in EFFECTS if effect.name == "concentration_delay")
+DELAY = effect_of("concentration_delay")
 
 
 def test_each_value_is_where_it_was_true_and_inputs_are_held() -> None:

@@ -16,20 +16,15 @@ from reactorwatch.diagnosis.fitting.profiles import Constant, Decay, FittedProfi
 from reactorwatch.diagnosis.fitting.signatures import solve_bounded
 from reactorwatch.diagnosis.result import NAMED
 from reactorwatch.diagnosis.run import Run
-from reactorwatch.diagnosis.search.dynamic_effects_screen import DynamicEffectsScreen
-from reactorwatch.diagnosis.search.pair_screen import PairScreen
+from reactorwatch.diagnosis.search.dynamic_and_pair_screens import DynamicEffectsScreen, PairScreen
 from reactorwatch.diagnosis.search.screen import DECAYS, Screen
 from reactorwatch.kalman.error_dynamics import ErrorDynamics
-from reactorwatch.process.effect import Effect
 from reactorwatch.process.library.cstr import EFFECTS, cstr
 from tests.unit.diagnosis.runs import make_run, record_of
+from tests.unit.process.effect_named import effect_of
 
 NOISY = Noise((0.002, 0.3), (0.001, 0.3))
 NAMES = ("coolant_flow", "reaction_rate", "temperature_bias", "concentration_gain")
-
-
-def effect_of(name: str) -> Effect:
-    return next(effect for effect in EFFECTS if effect.name == name)
 
 
 @pytest.fixture(scope="module")
@@ -129,7 +124,7 @@ def test_a_break_after_a_row_hides_no_cause(run: Run) -> None:
 
 
 TIME_MIN: Array = np.arange(0.0, 100.0, 0.1)
-LAG = next(effect for effect in EFFECTS if effect.name == "jacket_lag")
+LAG = effect_of("jacket_lag")
 
 
 @pytest.mark.parametrize(

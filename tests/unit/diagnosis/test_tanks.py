@@ -24,13 +24,14 @@ from reactorwatch.process.effect import Effect
 from reactorwatch.process.extended_model import parse_extended_model
 from reactorwatch.process.library.cascaded_tanks import EFFECTS as TANK_EFFECTS
 from reactorwatch.process.library.cascaded_tanks import tanks
-from reactorwatch.process.library.cstr import EFFECTS, cstr
+from reactorwatch.process.library.cstr import cstr
 from reactorwatch.process.library.three_tanks import three_tanks
 from reactorwatch.process.simulate import Simulator
 from reactorwatch.records.record import Record
 from reactorwatch.sentences.diagnosis import describe_verdict, diagnosis_text
 from tests.unit.diagnosis.rig import LOWER_SPILL_PER_MIN, NOISE_V, Rig, record_of
 from tests.unit.diagnosis.runs import make_run as reactor_run
+from tests.unit.process.effect_named import effect_of
 
 
 @pytest.fixture(scope="module")
@@ -249,7 +250,7 @@ def test_three_lasting_causes_are_fitted_together() -> None:
 
 
 SENSORS = Noise((0.002, 0.3), (0.0, 0.0))
-COOLANT = next(effect for effect in EFFECTS if effect.name == "coolant_flow")
+COOLANT = effect_of("coolant_flow")
 
 
 def without_changes(run: Run) -> Run:

@@ -19,10 +19,10 @@ from reactorwatch.diagnosis.unknown_input.localise import UnknownInput, has_feed
 from reactorwatch.diagnosis.unknown_input.smoother import PathModel, normalize_columns, smooth
 from reactorwatch.kalman.batch import FilterRecord
 from reactorwatch.kalman.noise_estimation import fit_noise
-from reactorwatch.process.effect import Effect
 from reactorwatch.process.library.cstr import EFFECTS, cstr
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.simulate import Simulator
+from tests.unit.process.effect_named import effect_of
 
 STEPS, N_X, N_Y = 7, 2, 2
 VARIANCE = 0.7
@@ -115,10 +115,6 @@ def test_a_further_column_is_whitened_as_the_difference_that_it_makes() -> None:
 
 
 ROWS, PERIOD_MIN, NOISE = 1500, 0.1, np.array([0.002, 0.3])
-
-
-def effect_of(name: str) -> Effect:
-    return next(effect for effect in EFFECTS if effect.name == name)
 
 
 def make_run(plant: ProcessModel, shown: Callable[[Array], Array] = lambda outputs: outputs) -> Run:

@@ -130,9 +130,6 @@ def test_without_any_disturbance_only_the_leak_is_alarmed(undisturbed: RunOutput
     assert counted.late == counted.lost == counted.duplicated == counted.out_of_order == counted.incomplete_rows == 0
 
 
-# --- doubled, late, out of order -----------------------------------------------------------------------------
-
-
 # --- missing -------------------------------------------------------------------------------------------------
 
 
@@ -212,21 +209,20 @@ def test_irregular_intervals_raise_no_alarm_in_a_sound_plant(spread: float) -> N
 # --- the plant's clock ---------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("by_min", [0.05, 60.0])
-def test_a_clock_that_is_set_forward_raises_no_alarm_and_the_plant_is_watched_on(sound: Run, by_min: float) -> None:
-    output = watched(sound.moved(EVENT, by_min).messages())
+@pytest.mark.parametrize(
+    ("by_min", "anew"),
+    [
+        *((by_min, False) for by_min in (0.05, 60.0, -0.5, -3.0, -10.0, -79.0)),
+        *((by_min, True) for by_min in (-79.0, -3.0, 500.0)),
+    ],
+)
+def test_a_clock_that_is_set_and_a_publisher_that_begins_again_raise_no_alarm_and_the_plant_is_watched_on(
+    sound: Run, by_min: float, *, anew: bool
+) -> None:
+    """The numbers go on, or begin again, so the samples are new, however old their times."""
+    output = watched(sound.moved(EVENT, by_min, numbered_from_0=anew).messages())
     assert output.raised == []
     assert output.phase == "watching"
-    assert output.health.rows == ROWS
-    assert output.health.lost == 0
-    assert {("C", to_time_ns(109.0 + by_min)), ("T", to_time_ns(109.0 + by_min))} <= output.estimated.keys()
-
-
-@pytest.mark.parametrize("by_min", [-0.5, -3.0, -10.0, -79.0])
-def test_a_clock_that_is_set_back_raises_no_alarm_and_the_plant_is_watched_on(sound: Run, by_min: float) -> None:
-    """The numbers go on, so the samples are new, however old their times."""
-    output = watched(sound.moved(EVENT, by_min).messages())
-    assert output.raised == []
     assert output.health.rows == ROWS
     assert output.health.late == output.health.lost == output.health.duplicated == 0
     assert {("C", to_time_ns(109.0 + by_min)), ("T", to_time_ns(109.0 + by_min))} <= output.estimated.keys()
@@ -239,16 +235,6 @@ def test_a_gap_in_the_samples_is_counted_and_raises_no_alarm(sound: Run, rows: i
     assert output.health.lost == 3 * rows
     assert output.health.incomplete_rows == 0
     assert {("C", to_time_ns(109.0)), ("T", to_time_ns(109.0))} <= output.estimated.keys()
-
-
-@pytest.mark.parametrize("by_min", [-79.0, -3.0, 500.0])
-def test_a_publisher_that_begins_again_at_any_time_raises_no_alarm_and_is_watched_on(sound: Run, by_min: float) -> None:
-    output = watched(sound.moved(EVENT, by_min, numbered_from_0=True).messages())
-    assert output.raised == []
-    assert output.phase == "watching"
-    assert output.health.rows == ROWS
-    assert output.health.late == output.health.lost == output.health.duplicated == 0
-    assert {("C", to_time_ns(109.0 + by_min)), ("T", to_time_ns(109.0 + by_min))} <= output.estimated.keys()
 
 
 @pytest.mark.parametrize(

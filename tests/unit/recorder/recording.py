@@ -12,12 +12,10 @@ from reactorwatch.contract.codec import Body, Encoded, Publication, decode, enco
 from reactorwatch.contract.messages_pb2 import Alarm, Health, Sample
 from recorder import RecordedMessage
 from recorder.config import RecorderConfig
-from recorder.files.ages import BootClock
-from recorder.files.part_file import PartFile
 from recorder.files.recording import Recording
-from recorder.files.writer import RecordingWriter, part_of
+from recorder.files.writer import PartFile, RecordingWriter, part_of
 from recorder.node import RecorderNode
-from recorder.recording_files import RecordingFiles
+from recorder.recording_files import BootClock, RecordingFiles
 
 SECOND = 1_000_000_000
 MINUTE = 60 * SECOND

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from recorder.files.ages import Ages, read_boot_clock
 from recorder.keep import DAY_NS
+from recorder.recording_files import Ages, read_boot_clock
 from tests.unit.recorder import golden
 from tests.unit.recorder.recording import SECOND, Confirmed, Fed, recorder, samples
 
@@ -158,7 +158,7 @@ def test_a_recording_is_as_old_as_its_completion_though_it_is_listed_later(tmp_p
 def test_without_the_identifier_of_the_boot_no_boot_is_claimed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     identifier = tmp_path / "boot_id"
     identifier.write_text("7-7\n")
-    monkeypatch.setattr("recorder.files.ages._BOOT_ID", identifier)
+    monkeypatch.setattr("recorder.recording_files._BOOT_ID", identifier)
     assert read_boot_clock().boot == "7-7"
     identifier.unlink()
     first, second = read_boot_clock(), read_boot_clock()

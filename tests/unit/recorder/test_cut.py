@@ -17,8 +17,8 @@ from reactorwatch.runtime.reorder_buffer import Gap
 from recorder import RecordedMessage, StoredMessage
 from recorder.config import RecorderConfig
 from recorder.files.copies import Window, cut, recover, sample_window
-from recorder.files.reader import StoredChannel
 from recorder.files.recording import GAP, Recording, gap_metadata, parse_gap
+from recorder.files.writer import StoredChannel
 from recorder.recording_files import RecordingFiles
 from recorder.tools.convert import read_record
 from recorder.tools.inspect import inspect

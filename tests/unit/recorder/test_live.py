@@ -1,7 +1,10 @@
 """The live dashboard: the stream that a viewer receives, and what it shows of the run before it was opened."""
 
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -51,20 +54,26 @@ def drawn_lines(path: Path) -> dict[str, tuple[NDArray[np.int64], NDArray[np.flo
     return {name: (np.concatenate(times[name]), np.concatenate(values[name])) for name in times}
 
 
-@pytest.mark.parametrize("each_ns", [1_000_000, 40_000_000], ids=["many messages a picture", "few messages a picture"])
-def test_all_of_a_run_is_sent_in_whatever_pieces_it_comes(run: RunColumns, tmp_path: Path, each_ns: int) -> None:
+@contextmanager
+def dashboard_into(path: Path, *history: Any) -> Iterator[LiveDashboard]:
+    """A live dashboard whose stream is a file."""
     recording = rr.RecordingStream("test")
-    recording.save(tmp_path / "sent.rrd")
-    dashboard = LiveDashboard(recording, lambda: False, 0)
-    now_ns = 0
-    for message in MESSAGES:
-        now_ns += each_ns
-        while dashboard.next_tick_ns() < now_ns:
-            dashboard.on_tick(dashboard.next_tick_ns())
-        assert dashboard.on_message(message, now_ns) == []
-    dashboard.on_stop(now_ns)
+    recording.save(path)
+    yield LiveDashboard(recording, lambda: False, 0, *history)
     recording.flush()
     recording.disconnect()
+
+
+@pytest.mark.parametrize("each_ns", [1_000_000, 40_000_000], ids=["many messages a picture", "few messages a picture"])
+def test_all_of_a_run_is_sent_in_whatever_pieces_it_comes(run: RunColumns, tmp_path: Path, each_ns: int) -> None:
+    with dashboard_into(tmp_path / "sent.rrd") as dashboard:
+        now_ns = 0
+        for message in MESSAGES:
+            now_ns += each_ns
+            while dashboard.next_tick_ns() < now_ns:
+                dashboard.on_tick(dashboard.next_tick_ns())
+            assert dashboard.on_message(message, now_ns) == []
+        dashboard.on_stop(now_ns)
     sent = drawn_lines(tmp_path / "sent.rrd")
     for signal, measured in run.samples.items():
         (times, values), *others = (
@@ -150,6 +159,13 @@ def alarm(name: str) -> messages.Alarm:
     )
 
 
+def as_raised(name: str) -> Encoded:
+    """The message with which an alarm was raised, as its publisher sent it."""
+    raised = alarm(name)
+    raised.time_ns, raised.event = raised.raised_ns, "raised"
+    return encode(Publication(f"reactor/cstr/alarm/{name}", raised))
+
+
 LISTED = [*map(alarm, RAISED_MIN), messages.Alarm(alarm="stuck/T", state=messages.ALARM_STATE_NORMAL)]
 HEALTH = messages.Health(node="monitor", heard_from_ns={"T": ZERO_NS + 1, "C": ZERO_NS})
 
@@ -187,14 +203,10 @@ def logged(path: Path) -> list[tuple[float, str]]:
 
 
 def shown(tmp_path: Path, past: RunHistory, received: list[Encoded]) -> list[tuple[float, str]]:
-    recording = rr.RecordingStream("test")
-    recording.save(tmp_path / "sent.rrd")
-    dashboard = LiveDashboard(recording, lambda: False, 0, past)
-    for number, message in enumerate(received):
-        dashboard.on_message(message, number)
-    dashboard.on_tick(DRAW_INTERVAL_NS)
-    recording.flush()
-    recording.disconnect()
+    with dashboard_into(tmp_path / "sent.rrd", past) as dashboard:
+        for number, message in enumerate(received):
+            dashboard.on_message(message, number)
+        dashboard.on_tick(DRAW_INTERVAL_NS)
     return logged(tmp_path / "sent.rrd")
 
 
@@ -219,10 +231,7 @@ def test_all_active_alarms_are_shown_with_their_suspects_at_their_minutes(
 
 
 def test_a_change_that_publishers_remember_is_shown_once(tmp_path: Path, past: RunHistory) -> None:
-    again = alarm("drift/C")
-    again.time_ns, again.event = again.raised_ns, "raised"
-    remembered = encode(Publication("reactor/cstr/alarm/drift/C", again))
-    lines = shown(tmp_path, past, [sample(NOW_NS), remembered])
+    lines = shown(tmp_path, past, [sample(NOW_NS), as_raised("drift/C")])
     assert sum("drift/C" in text for _, text in lines) == 1
 
 
@@ -233,17 +242,11 @@ def test_the_present_state_of_each_is_the_last_that_is_known(past: RunHistory) -
 
 def test_alarms_that_come_before_the_first_sample_are_not_lost(tmp_path: Path) -> None:
     """Of a plant without a monitor that could be asked."""
-    raised = alarm("ewma/T")
-    raised.time_ns, raised.event = raised.raised_ns, "raised"
-    recording = rr.RecordingStream("test")
-    recording.save(tmp_path / "sent.rrd")
-    dashboard = LiveDashboard(recording, lambda: False, 0)
-    dashboard.on_message(encode(Publication("reactor/cstr/alarm/ewma/T", raised)), 0)
-    dashboard.on_tick(DRAW_INTERVAL_NS)
-    dashboard.on_message(sample(ZERO_NS), DRAW_INTERVAL_NS)
-    dashboard.on_tick(2 * DRAW_INTERVAL_NS)
-    recording.flush()
-    recording.disconnect()
+    with dashboard_into(tmp_path / "sent.rrd") as dashboard:
+        dashboard.on_message(as_raised("ewma/T"), 0)
+        dashboard.on_tick(DRAW_INTERVAL_NS)
+        dashboard.on_message(sample(ZERO_NS), DRAW_INTERVAL_NS)
+        dashboard.on_tick(2 * DRAW_INTERVAL_NS)
     assert [text for _, text in logged(tmp_path / "sent.rrd")] == ["312.5 min  ewma/T: text of ewma/T"]
 
 
@@ -276,27 +279,21 @@ def test_a_monitor_that_comes_later_answers_late_and_restarts_is_asked_until_it_
     assert past.answered == {"monitor"}
     ask = Answering(RunHistory(), RunHistory(), past)
     query = HistoryQuery(ask)
-    recording = rr.RecordingStream("test")
-    recording.save(tmp_path / "sent.rrd")
-    dashboard = LiveDashboard(recording, lambda: False, 0, RunHistory(zero_ns=ZERO_NS), query)
-    dashboard.on_message(sample(NOW_NS), 0)
-    by_itself = alarm("drift/C")
-    by_itself.time_ns, by_itself.event = by_itself.raised_ns, "raised"
-    dashboard.on_message(encode(Publication("reactor/cstr/alarm/drift/C", by_itself)), 0)
-    for round_of in range(3):
-        ask.was_last.clear()
-        for token in (keys.key("cstr", keys.ALIVE, "plant"), keys.monitor_token("cstr", "x"), MONITOR):
-            dashboard.on_alive(token, True, 0)
-        assert ask.was_last.wait(60.0)
-        if (thread := query._thread) is not None:
-            thread.join(60.0)
-        dashboard.on_alive(MONITOR, True, 0)  # as a token that is shown again; it has answered
-        assert ask.asked == 3 + round_of
-        dashboard.on_tick(DRAW_INTERVAL_NS * (1 + round_of))
-        dashboard.on_alive(MONITOR, False, 0)
-    dashboard.on_stop(DRAW_INTERVAL_NS * 10)
-    recording.flush()
-    recording.disconnect()
+    with dashboard_into(tmp_path / "sent.rrd", RunHistory(zero_ns=ZERO_NS), query) as dashboard:
+        dashboard.on_message(sample(NOW_NS), 0)
+        dashboard.on_message(as_raised("drift/C"), 0)
+        for round_of in range(3):
+            ask.was_last.clear()
+            for token in (keys.key("cstr", keys.ALIVE, "plant"), keys.monitor_token("cstr", "x"), MONITOR):
+                dashboard.on_alive(token, True, 0)
+            assert ask.was_last.wait(60.0)
+            if (thread := query._thread) is not None:
+                thread.join(60.0)
+            dashboard.on_alive(MONITOR, True, 0)  # as a token that is shown again; it has answered
+            assert ask.asked == 3 + round_of
+            dashboard.on_tick(DRAW_INTERVAL_NS * (1 + round_of))
+            dashboard.on_alive(MONITOR, False, 0)
+        dashboard.on_stop(DRAW_INTERVAL_NS * 10)
     lines = logged(tmp_path / "sent.rrd")
     assert [text.partition("  ")[2].partition(":")[0] for _, text in lines].count("drift/C") == 1
     assert len(lines) == len(RAISED_MIN) + 2
@@ -316,16 +313,11 @@ def test_the_minutes_of_a_fleet_s_plant_count_from_its_first_sample_once_its_mon
     tmp_path: Path, past: RunHistory, *, reports: bool
 ) -> None:
     """Nothing is drawn before; without a report, they count from the first sample that came, after a while."""
-    recording = rr.RecordingStream("test")
-    recording.save(tmp_path / "sent.rrd")
-    dashboard = LiveDashboard(recording, lambda: False, 0, past._replace(zero_ns=None))
-    dashboard.on_message(sample(NOW_NS), 0)
-    dashboard.on_tick(DRAW_INTERVAL_NS)
-    recording.flush()
-    if reports:
-        dashboard.on_message(encode(Publication("reactor/cstr/health/monitor", HEALTH)), DRAW_INTERVAL_NS)
-    dashboard.on_tick(2 * DRAW_INTERVAL_NS if reports else ZERO_TIMEOUT_NS)
-    recording.flush()
-    recording.disconnect()
+    with dashboard_into(tmp_path / "sent.rrd", past._replace(zero_ns=None)) as dashboard:
+        dashboard.on_message(sample(NOW_NS), 0)
+        dashboard.on_tick(DRAW_INTERVAL_NS)
+        if reports:
+            dashboard.on_message(encode(Publication("reactor/cstr/health/monitor", HEALTH)), DRAW_INTERVAL_NS)
+        dashboard.on_tick(2 * DRAW_INTERVAL_NS if reports else ZERO_TIMEOUT_NS)
     minutes = {text.partition("  ")[2].partition(":")[0]: minute for minute, text in logged(tmp_path / "sent.rrd")}
     assert minutes["drift/C"] == (402.0 if reports else 402.0 - 500.0)

@@ -11,8 +11,8 @@ import pytest
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Encoded, Publication, encode
 from recorder.core import DISK_ALARM, KEYS_ALARM
-from recorder.files.part_file import DELETED
 from recorder.files.recording import Recording
+from recorder.files.writer import DELETED
 from recorder.keep import MAX_OTHER_CHANNELS
 from tests.unit.recorder import golden
 from tests.unit.recorder.recording import SECOND, Disk, Fed, alarm, recorder, samples, sequences

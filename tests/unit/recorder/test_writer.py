@@ -22,10 +22,18 @@ from reactorwatch.contract.messages_pb2 import QUALITY_GOOD, Sample
 from reactorwatch.errors import InputError
 from recorder import RecordedMessage
 from recorder.files.copies import recover
-from recorder.files.part_file import PART, PartFile, is_locked, lock_orphan
-from recorder.files.reader import Reader, StoredChannel, metadata_records
+from recorder.files.reader import Reader, metadata_records
 from recorder.files.recording import Recording
-from recorder.files.writer import RecordingWriter, WriteError, check_free
+from recorder.files.writer import (
+    PART,
+    PartFile,
+    RecordingWriter,
+    StoredChannel,
+    WriteError,
+    check_free,
+    is_locked,
+    lock_orphan,
+)
 from tests.unit.recorder import golden
 from tests.unit.recorder.recording import Disk
 
