@@ -27,7 +27,7 @@ class ForeignFileError(InputError):
 
 
 MAGIC = b"reactorwatch monitor"
-VERSION = 9
+VERSION = 10
 """Version of the layout of the stored state."""
 
 

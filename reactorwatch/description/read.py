@@ -24,7 +24,7 @@ from reactorwatch.errors import InputError, describe_exception, describe_unknown
 from reactorwatch.process import DEFAULT_PROCESS, MODELS
 from reactorwatch.process.extended_model import ExtendedModel, parse_extended_model
 from reactorwatch.process.model import ProcessModel
-from reactorwatch.records.decode import read_regular, wrap_read_errors
+from reactorwatch.records.decode import check_workbook, read_regular, wrap_read_errors
 from reactorwatch.records.file_format import GUESS, FileFormat
 from reactorwatch.records.read import MissingColumnError, SignalColumn, read_table
 from reactorwatch.records.record import LARGEST_VALUE, Record
@@ -294,6 +294,7 @@ def read_process_table(
     Raises:
         InputError: as `read_table`; or `columns` names no signal of the process.
     """
+    check_workbook(path, stated.sheet)  # that of the process is for its workbooks, and it may have other files too
     names, stated = dict(columns or {}), process.file_format.override(stated)
     for name, unit in STANDARD.items():
         if name in names:
