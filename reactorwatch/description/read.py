@@ -21,7 +21,7 @@ from reactorwatch.arrays import Array
 from reactorwatch.description.process import Process, Signal, describe_model
 from reactorwatch.description.toml_file import parse_process, parse_tables
 from reactorwatch.errors import InputError, describe_exception, describe_unknown, prefix_errors
-from reactorwatch.process import MODELS
+from reactorwatch.process import DEFAULT_PROCESS, MODELS
 from reactorwatch.process.extended_model import ExtendedModel, parse_extended_model
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.decode import check_workbook, read_regular, wrap_read_errors
@@ -33,8 +33,6 @@ from reactorwatch.units import conversion
 
 FUNCTION = "process"
 """Function of a `.py` file that returns the process."""
-
-DEFAULT_PROCESS = "cstr"
 
 FILE_KINDS = (".toml", ".py", ".json")
 """Suffixes of files that describe a process."""
