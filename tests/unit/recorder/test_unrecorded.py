@@ -258,3 +258,14 @@ def test_silent_keys_give_their_budget_to_others_in_the_next_file(tmp_path: Path
     first, second_file = Recording(tmp_path).files
     assert recorded_keys(second_file) == {"reactor/cstr/sample/T", "reactor/cstr/health/recorder"}
     assert "reactor/cstr/sample/T" not in recorded_keys(first)
+
+
+def test_repeated_messages_leave_half_of_the_keys_of_a_file_to_others(tmp_path: Path) -> None:
+    fed = recorder(tmp_path, START, most_keys=100, rotate_min=1.0, black_box_min=0.0)
+    receive(fed, (encode(alarm(f"ewma/{number}")) for number in range(100)))
+    fed.pass_time(61 * SECOND)
+    receive(fed, (sample(f"p{number}") for number in range(60)))
+    fed.stop()
+    last = recorded_keys(Recording(tmp_path).files[-1])
+    plants = {f"reactor/p{number}/sample/T" for number in range(60)}
+    assert len(plants & last) == 50
