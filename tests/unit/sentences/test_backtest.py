@@ -103,6 +103,11 @@ def test_an_incident_without_a_named_cause_lists_what_deviates() -> None:
     ]
 
 
+def test_the_headline_of_an_alarm_that_names_its_cause_is_its_text() -> None:
+    alarm = raised("stuck/T", 150.3, None, 1, text="T is stuck; Q1 is at its upper bound")
+    assert headline([alarm], 0) == ["Detected since 150.3 min: T is stuck; 1 alarm, stuck/T at 150.3 min"]
+
+
 def test_the_headline_of_a_record_with_clock_time_states_it() -> None:
     """For minutes from the epoch, as in Python, and from the clock time itself, as in the command."""
     day = to_time_ns(1_000_000.0)
