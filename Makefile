@@ -7,7 +7,7 @@ BIN := .venv/bin
 # keep bytecode: without it each process that tests start compiles every module again
 unexport PYTHONDONTWRITEBYTECODE
 # each has a target of its own
-LONG_STUDIES := $(addprefix benchmarks/,fault_bank.py diagnosis_study.py recorder_kills.py link_cuts.py fuzz.py)
+LONG_STUDIES := $(addprefix benchmarks/,diagnosis_study.py losses.py fuzz.py)
 READY := .venv/.ready
 PYTEST := $(BIN)/python -m pytest --numprocesses auto --dist loadfile --no-loadscope-reorder
 DOCS_READY := .venv/.docs-ready
@@ -50,16 +50,16 @@ bench: $(READY) ## speed, as ratios measured in one run
 		echo "== $$file"; $(BIN)/python $$file || exit 1; done
 
 faults: $(READY) ## detection delays on a bank of faults, beside an oracle and the report's method: most of an hour
-	@$(BIN)/python benchmarks/fault_bank.py --write docs/fault_bank.md $(if $(RESULTS),--results $(RESULTS))
+	@$(BIN)/python -m benchmarks.faults --write docs/fault_bank.md $(if $(RESULTS),--results $(RESULTS))
 
 study: $(READY) ## the diagnosis of hidden causes; writes its tables into docs/diagnosis_study.md: hours
 	@$(BIN)/python benchmarks/diagnosis_study.py --write $(if $(RESULTS),--results $(RESULTS))
 
 kills: $(READY) ## kill a recorder fifty times under load, and count what is missing: three minutes
-	@$(BIN)/python benchmarks/recorder_kills.py
+	@$(BIN)/python benchmarks/losses.py kills
 
 cuts: $(READY) ## cut links and kill routers under load for up to 30 seconds, and count what is missing: five minutes
-	@$(BIN)/python benchmarks/link_cuts.py
+	@$(BIN)/python benchmarks/losses.py cuts
 
 fuzz: $(READY) ## 200,000 random messages, commands, states and settings: no failure, no alarm; two minutes
 	@$(BIN)/python benchmarks/fuzz.py

@@ -15,11 +15,16 @@ import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from benchmarks.harness.pool import Pool, add_options
-from benchmarks.harness.tables import replace_between, stamp
+from benchmarks.harness.study import Pool, add_options, replace_between, stamp
 from benchmarks.hidden.classes import CLASSES, StudyClass, draw_record, find_class
-from benchmarks.hidden.score import confusion_table, failures, main_table, reliability_table
-from benchmarks.hidden.suspects import SuspectsJudged, judge_suspects
+from benchmarks.hidden.score import (
+    SuspectsJudged,
+    confusion_table,
+    failures,
+    judge_suspects,
+    main_table,
+    reliability_table,
+)
 from reactorwatch.diagnosis.diagnose import diagnose
 from reactorwatch.process.library.cstr import cstr
 from reactorwatch.runtime.jobs import Failed

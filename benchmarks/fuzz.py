@@ -1,7 +1,6 @@
 """Fuzz test: no message, command, state or setting makes a node fail or raise a false alarm.
 
 Random and mutated messages are put between the samples of a sound plant and fed to the cores of monitor and recorder,
-runs of bad values take the place of samples while causes are looked for,
 mutated commands to monitor and plant, mutated bytes to what reads a stored state, and mutated settings to what reads
 settings files. Nothing may raise, what is refused must be counted or answered in one line, and the monitor must say of
 its alarms what it says without all this.
@@ -18,13 +17,10 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
-from monitor_node.fleet.monitor import ANY, FleetMonitor, PlantKind
-from monitor_node.learn.signal_range import signal_ranges
 from plant_node.config import PlantConfig
 from plant_node.node import PlantNode
 from plant_node.record import plant_from, simulate_record
@@ -33,25 +29,17 @@ from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import MESSAGES, Encoded, Publication, encode, encode_message, encoding_of
 from reactorwatch.errors import InputError
-from reactorwatch.process.library.cstr import cstr
 from reactorwatch.runtime.config import SECTIONS, BusConfig, read_settings, section
 from recorder.config import RecorderConfig
 from recorder.core import Recorder
 from recorder.tools.player import samples_of
 
-COUNT, COMMANDS, SETTINGS, STATES, VALUES = 200_000, 20_000, 20_000, 5_000, 10_000
-PAIR = ("bad", "sound")
-RESTART_ROWS = 50
-"""Rows between two restarts."""
-
+COUNT, COMMANDS, SETTINGS, STATES = 200_000, 20_000, 20_000, 5_000
 BETWEEN = 5
 """Strange messages for each row of the plant."""
 
 PLANTS = 0.1
 """Share of the valid settings from which a plant is made: that takes a while."""
-
-LONGEST_RUN = 50
-"""Bad values in a row."""
 
 MONITOR = MonitorConfig(training_min=20.0)
 SPECIAL = (0.0, -0.0, 1.0, -1.0, 438.5, 1e-300, 1e15, 1e30, 1e300, float("nan"), float("inf"), -float("inf"))
@@ -98,12 +86,6 @@ class Mutator:
             }
             setattr(sample, field, anything[field]())
         return sample
-
-    def with_value(self, base: Encoded, value: float) -> Encoded:
-        """The same sample with another value."""
-        sample = messages.Sample.FromString(base.payload)
-        sample.value = value
-        return base._replace(payload=sample.SerializeToString())
 
     def flip_bits(self, data: bytes) -> bytes:
         """Flip some bits."""
@@ -190,64 +172,6 @@ def fuzz_messages(count: int, seed: int = 1) -> dict[str, int]:
         "taken for the plant's": taken,
         "alarms": len(alarms[1]),
     }
-
-
-def fuzz_values(count: int, seed: int = 5) -> dict[str, int]:
-    """Put runs of 1 to 50 bad values into one of two plants of a fleet, and start a monitor again after each.
-
-    No error of the software may come up, the other plant is judged as if it were alone, and a monitor that is started
-    again and reads the samples of the run again tells the same alarms.
-    """
-    mutator, draw = Mutator(seed), random.Random(seed)
-    bad, places = _bad_values(draw, max(count, LONGEST_RUN))
-    rows = max(place // 3 for place in places) + 60
-    bad_plant, sound_plant = (
-        [encode(item) for item in samples_of(simulate_record(PlantConfig(seed=seed + at), rows), plant, 0)]
-        for at, plant in enumerate(("bad", "sound"))
-    )
-    for place, value in zip(places, bad, strict=True):
-        bad_plant[place] = mutator.with_value(bad_plant[place], value)
-    fleet = FleetMonitor([PlantKind(ANY, MONITOR, None)], 0)
-    alone = {plant: Monitor(msgspec.structs.replace(MONITOR, plant=plant), 0, points=False) for plant in PAIR}
-    stored, fed_until, restarts = b"", 0, 0
-    told, expected = list[Publication](), list[Publication]()
-    for first in range(0, len(bad_plant), 3 * RESTART_ROWS):
-        part = slice(first, first + 3 * RESTART_ROWS)
-        told += fleet.on_messages([*bad_plant[part], *sound_plant[part]], first * 10**9)
-        for plant, published in zip(PAIR, (bad_plant, sound_plant), strict=True):
-            expected += [item for message in published[part] for item in alone[plant].on_message(message, 0)]
-        if stored:
-            again = Monitor(alone["bad"].config, 0, points=False)
-            again.from_bytes(stored)
-            for message in bad_plant[max(fed_until - 60, 0) : part.stop]:
-                again.on_message(message, 0)
-            assert again.alarms.memory == alone["bad"].alarms.memory, "the alarms after a restart are others"
-            assert again.failures.by_stage == {}, again.failures.notes
-            restarts += 1
-        stored, fed_until = alone["bad"].to_bytes(), part.stop
-    for plant in PAIR:
-        begin = f"reactor/{plant}/alarm/"
-        said = [[encode(item) for item in of if item.key.startswith(begin)] for of in (told, expected)]
-        assert said[0] == said[1], f"the alarms of {plant} in the fleet are others"
-        assert alone[plant].failures.by_stage == {}, alone[plant].failures.notes
-    raised = [item for item in expected if "/bad/alarm/" in item.key]
-    return {"bad values": len(places), "restarts": restarts, "changes of alarms": len(raised)}
-
-
-def _bad_values(draw: random.Random, count: int) -> tuple[list[float], list[int]]:
-    """Values within the range of a signal, at its edges and anywhere, and the samples that they take the place of."""
-    signals = MONITOR.signals
-    row, values, places = 250, list[float](), list[int]()
-    while len(values) < count:
-        signal, rows = draw.randrange(len(signals)), draw.randrange(1, LONGEST_RUN + 1)
-        lower, upper, _ = signal_ranges(cstr(), signals)[signal]
-        far = draw.choice((-1, 1)) * 10.0 ** draw.uniform(-3.0, 14.9)
-        value = draw.choice((draw.uniform(lower, upper), lower, upper, far, -999.0, 65535.0))
-        spread = draw.choice((0.0, 1e-3, 0.1)) * (upper - lower)
-        values += [value + spread * draw.random() for _ in range(rows)]
-        places += [3 * (row + at) + signal for at in range(rows)]
-        row += rows + draw.randrange(1, 100)
-    return values, places
 
 
 def _health(said: list[Publication]) -> messages.Health:
@@ -347,7 +271,6 @@ def studies(count: int) -> Iterator[tuple[str, Callable[[], dict[str, int]]]]:
     """Yield the studies by name, with a number of messages and all else in proportion."""
     share = count / COUNT
     yield "messages", lambda: fuzz_messages(count)
-    yield "bad values", lambda: fuzz_values(round(VALUES * share))
     yield "commands", lambda: fuzz_commands(round(COMMANDS * share))
     yield "stored states", lambda: fuzz_states(round(STATES * share))
     yield "settings", lambda: fuzz_settings(round(SETTINGS * share))

@@ -27,8 +27,8 @@ from reactorwatch.records.record import to_time_ns
 from reactorwatch.runtime.bus_zenoh import connect, router
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.event_loop import StopSignal
-from reactorwatch.runtime.logs import configure
-from reactorwatch.runtime.loopback import free_endpoint
+from reactorwatch.runtime.http_pages import free_endpoint
+from reactorwatch.runtime.node_main import configure_log
 
 UNITS = cstr().units
 
@@ -38,7 +38,7 @@ ECHO = """
 import sys, threading
 from reactorwatch.runtime.bus_zenoh import connect
 from reactorwatch.runtime.config import BusConfig
-from reactorwatch.runtime.logs import configure
+from reactorwatch.runtime.node_main import configure_log
 from reactorwatch.runtime.event_loop import StopSignal
 bus = connect(BusConfig(endpoint=sys.argv[1]), "echo", StopSignal())
 bus.subscribe("reactor/cstr/sample/T", lambda message: bus.publish(message._replace(key="echo/T")))
@@ -71,7 +71,7 @@ class Arrivals:
 
 def main() -> None:
     """Measure and print."""
-    configure(logging.WARNING)
+    configure_log(logging.WARNING)
     config = BusConfig(endpoint=free_endpoint())
     monitor = MonitorConfig(
         outputs=("T",),

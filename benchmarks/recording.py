@@ -6,34 +6,28 @@ messages/s through a real router; writing and reading over the bare library's.
     python benchmarks/recording.py
 """
 
-import contextlib
-import signal
-import subprocess
-import sys
 import tempfile
-import threading
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, ClassVar
 
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
+from benchmarks.harness.site import Heard, Tokens, connect_client, recorder_process
 from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Encoded, Publication, decode, encode
-from reactorwatch.runtime import logs
-from reactorwatch.runtime.bus_zenoh import connect, router
+from reactorwatch.runtime.bus_zenoh import router
 from reactorwatch.runtime.config import BusConfig
-from reactorwatch.runtime.event_loop import StopSignal
-from reactorwatch.runtime.loopback import free_endpoint
+from reactorwatch.runtime.http_pages import free_endpoint
+from reactorwatch.runtime.node_main import configure_log
 from recorder import RecordedMessage
 from recorder.config import RecorderConfig
 from recorder.core import Recorder
-from recorder.files.part_file import PartFile
 from recorder.files.recording import Recording
-from recorder.files.writer import RecordingWriter
+from recorder.files.writer import PartFile, RecordingWriter
 from recorder.keep import Fsync
 from recorder.node import RecorderNode
 from recorder.recording_files import RecordingFiles
@@ -62,30 +56,12 @@ def samples(count: int) -> list[Encoded]:
     return out
 
 
-@contextlib.contextmanager
-def recorder_process(folder: Path, endpoint: str) -> Iterator[Path]:
-    """A recorder of its own process; it is stopped, and its file whole, when the context ends."""
-    path = folder / f"{time.monotonic_ns()}.mcap"
-    settings = folder / "settings.toml"
-    settings.write_text(f'[bus]\nendpoint = "{endpoint}"\n[recorder]\nout = "{path}"\nlinger_s = 1.0\n')
-    process = subprocess.Popen([sys.executable, "-m", "recorder", str(settings)], stderr=subprocess.DEVNULL)
-    try:
-        yield path
-    finally:
-        process.send_signal(signal.SIGTERM)
-        process.wait(60)
-
-
 def through_a_router(folder: Path, sent: list[Encoded], rate_per_s: float | None) -> tuple[float, float, float]:
     """(messages/s at which was published, share of them recorded, longest lag in s that the recorder reports)."""
     config = BusConfig(endpoint=free_endpoint())
-    hub = router(config)
-    with recorder_process(folder, config.endpoint) as path:
-        plant = connect(config, "benchmark", StopSignal())
-        assert plant is not None
-        ready = threading.Event()
-        plant.subscribe_liveliness(keys.all_keys("cstr", keys.ALIVE), lambda _, alive: ready.set() if alive else None)
-        assert ready.wait(30), "no recorder"
+    hub, plant, observer = router(config), connect_client(config), connect_client(config)
+    heard = Heard(observer)
+    with recorder_process(folder, config.endpoint, Tokens(observer)):
         start = time.perf_counter()
         for number, message in enumerate(sent):
             if rate_per_s and number % 20 == 0:
@@ -93,8 +69,10 @@ def through_a_router(folder: Path, sent: list[Encoded], rate_per_s: float | None
             plant.publish(message)
         plant.close()
         rate = len(sent) / (time.perf_counter() - start)
+        heard.wait(len(sent))
+    observer.close()
     hub.close()
-    entries = list(Recording(path).messages())
+    entries = list(Recording(folder).messages())
     lags = [decode(entry.payload, entry.encoding) for entry in entries if keys.HEALTH in entry.key]
     longest_s = max(report.lag_ms for report in lags if isinstance(report, messages.Health)) / 1e3
     return rate, sum("/sample/" in entry.key for entry in entries) / len(sent), longest_s
@@ -205,12 +183,14 @@ def fsync(folder: Path) -> None:
 
 def main() -> None:
     """Print the table."""
-    logs.configure()  # to standard error
+    configure_log()  # to standard error
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         sent = samples(RATE_PER_S * SECONDS)
         for rate in (float(RATE_PER_S), None):
-            got, share, lag_s = through_a_router(folder, sent, rate)
+            own = folder / str(rate)
+            own.mkdir()
+            got, share, lag_s = through_a_router(own, sent, rate)
             asked = f"at {rate:,.0f}/s" if rate else "flat out"
             print(f"recorded / published, {asked:18s} {share:5.3f}   ({got:,.0f} messages/s, lag up to {lag_s:.2f} s)")
         files(folder)

@@ -7,11 +7,10 @@ A table with, for each number of plants:
   counts the same messages, in the same run, and the ratio. A publisher sends as fast as it can. Seconds are those of
   the processor's time, of all threads of the process, so that others on the machine do not count;
 - the same without the bus: from bytes to results;
-- memory a plant: how much more the process takes with all plants than with a tenth of them;
-- the 99th percentile of the time from a sample to its alarm at one sample a second a plant, by the clock.
+- memory a plant: how much more the process takes with all plants than with a tenth of them.
 
-The plants resume from the state of one that was trained, with names of their own; all are ordinary but those that are
-given an alarm.
+The plants resume from the state of one that was trained, with names of their own. `latency.py` has the time from a
+sample to its alarm.
 
 Goal: at least 60,000 samples/s without the bus, so that 10,000 plants at 1 Hz take one core or two shards; at most
 130 kB a plant; live at least 45, 50 and 40 % of the bare subscriber with 1, 100 and 1,000 plants.
@@ -21,46 +20,100 @@ import gc
 import json
 import logging
 import os
+import struct
 import subprocess
 import sys
 import threading
 import time
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import zenoh
 
-from benchmarks.harness.traffic import (
-    FLEET,
-    KNOWN_ROWS,
-    LEARNED_ROWS,
-    MOST_ROWS,
-    SIGNALS,
-    alone_on_a_core,
-    plant_name,
-    publish,
-    record,
-    route,
-)
 from monitor_node.__main__ import UNCACHED, watch
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
-from monitor_node.fleet.config import FleetConfig
-from monitor_node.monitor_state import SEAL
+from monitor_node.fleet import FleetConfig
+from monitor_node.monitor_state import open_seal, seal
 from monitor_node.node import MonitorNode
+from plant_node.config import PlantConfig
+from plant_node.record import simulate_record
 from reactorwatch.contract import keys
-from reactorwatch.contract.codec import Encoded, Publication
-from reactorwatch.runtime.bus_zenoh import connect
+from reactorwatch.contract.codec import Encoded, Publication, encode, encoding_of
+from reactorwatch.contract.messages_pb2 import Sample
+from reactorwatch.runtime.bus_zenoh import connect, router
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.event_loop import StopSignal
-from reactorwatch.runtime.logs import configure
-from reactorwatch.runtime.loopback import free_endpoint
+from reactorwatch.runtime.http_pages import free_endpoint
+from reactorwatch.runtime.node_main import configure_log
+from recorder.tools.player import samples_of
+
+SIGNALS = 3
+LEARNED_ROWS = 900
+MOST_ROWS = 20_000
+SHARING = 250  # plants that share a session
+KNOWN_ROWS = 2  # of each plant, after which the router knows its keys; the time is taken from then on
+FLEET = "reactor/*"
+
+
+def plant_name(number: int) -> str:
+    """Name of a plant; all names have the same length, so that a state can be renamed."""
+    return f"p{number:05d}"
+
+
+def record() -> list[Encoded]:
+    """Messages of a plant."""
+    return [
+        encode(item)
+        for item in samples_of(simulate_record(PlantConfig(seed=1), LEARNED_ROWS + MOST_ROWS), plant_name(0))
+    ]
+
+
+def alone_on_a_core(core: int) -> None:
+    """Stay on one core, if there are others for the rest."""
+    if (os.cpu_count() or 1) > 1:
+        os.sched_setaffinity(0, {core})
+
+
+def route(endpoint: str) -> None:
+    """Be the router."""
+    alone_on_a_core(1)
+    hub = router(BusConfig(endpoint=endpoint))
+    print("ready", flush=True)
+    threading.Event().wait()
+    del hub
+
+
+def publish(endpoint: str, plants: int, rows: int) -> None:
+    """Publish rows of plants as fast as it goes."""
+    alone_on_a_core(1)
+    numbered, encoding = struct.Struct("<QQ"), encoding_of(Sample)
+    # A session takes the longer to declare a key the more it has; a real plant has one of its own.
+    buses = [connect(BusConfig(endpoint=endpoint), "publisher", StopSignal()) for _ in range(plants // SHARING + 1)]
+    publishers = [
+        [
+            buses[number // SHARING]._session.declare_publisher(  # type: ignore[union-attr]
+                keys.key(plant_name(number), keys.SAMPLE, signal),
+                encoding=encoding,
+                congestion_control=zenoh.CongestionControl.BLOCK,
+            )
+            for signal in ("qc", "C", "T")
+        ]
+        for number in range(plants)
+    ]
+    payloads = [item.payload for item in record()[SIGNALS * LEARNED_ROWS :]]
+    time.sleep(1.0)  # until the router knows all keys
+    for place in range(SIGNALS * rows):
+        for number in range(plants):
+            publishers[number][place % SIGNALS].put(payloads[place], attachment=numbered.pack(number + 1, place))
+    time.sleep(2.0)  # what is on its way still goes
+    os._exit(0)
+
 
 SIZES = (1, 10, 100, 1000, 10_000)
 FAST_SAMPLES = 600_000
-LATENCY_S = 15
 IDLE_S = 10.0
 PATIENT = 1e6  # periods: between training and the first sample live a plant is no silent one
 FAST = MonitorConfig(
@@ -69,17 +122,6 @@ FAST = MonitorConfig(
     silence_periods=PATIENT,
     diagnose_training=False,  # the work of another process
 )
-SHARP = MonitorConfig(
-    training_min=20.0,
-    charts=("shewhart",),
-    raise_count=1,
-    window=1,
-    clear_count=1,
-    isolation=False,
-    silence_periods=PATIENT,
-    diagnose_training=False,
-)
-"""One point out raises an alarm, one point back in clears it."""
 
 
 def fast_rows(count: int) -> int:
@@ -125,12 +167,12 @@ class Counting(MonitorNode):
                 super().on_messages(messages[index : index + 1], start_ns + index * 10**9)
         trained = self.monitor(plant_name(0))
         assert trained.pipeline.evaluation.is_ordinary
-        body, few = SEAL.open(trained.to_bytes()), max(plants // 10, 1)
+        body, few = open_seal(trained.to_bytes()), max(plants // 10, 1)
         for number in range(1, plants):
             if number == few:
                 before = memory_bytes()
             name = plant_name(number)
-            state = SEAL.close(body.replace(plant_name(0).encode(), name.encode()))
+            state = seal(body.replace(plant_name(0).encode(), name.encode()))
             self.register(name, time.time_ns(), verified=True, restore=partial(_restore, state))
         self.on_history_end()
         return (memory_bytes() - before) // (plants - few) if plants > few else 0
@@ -140,25 +182,24 @@ def _restore(state: bytes, monitor: Monitor) -> None:
     monitor.from_bytes(state)
 
 
-def monitor(endpoint: str, plants: int, expected: int, sharp: bool) -> None:
-    """Watch the fleet until so many samples have come, or until terminated."""
+def monitor(endpoint: str, plants: int, expected: int) -> None:
+    """Watch the fleet until so many samples have come, or no more come."""
     alone_on_a_core(0)
     stop = StopSignal()
     bus = connect(BusConfig(endpoint=endpoint), "monitor", stop, uncached=UNCACHED, many_keys=True)
     assert bus is not None
-    node = Counting(SHARP if sharp else FAST, stop)
+    node = Counting(FAST, stop)
     taken = node.learn(plants)  # first: memory that another fleet has freed would be used again, and not be counted
-    core = 0.0 if sharp else without_bus(plants)
+    core = without_bus(plants)
     node.samples, node.expected, node.known = 0, expected, KNOWN_ROWS * SIGNALS * plants
     serving = threading.Thread(target=watch, args=(node, bus, stop))
     serving.start()
     print("ready", flush=True)
     last = -1
-    while serving.is_alive() and (sharp or not 0 < node.samples == last):  # or what is missing does not come any more
+    while serving.is_alive() and not 0 < node.samples == last:  # or what is missing does not come any more
         last = node.samples
         serving.join(IDLE_S)
-    if not sharp:
-        _check_known(node.samples, node.known)
+    _check_known(node.samples, node.known)
     result = {"samples": node.samples - node.before, "cpu_s": node.ended_s - node.began_s}
     print(json.dumps(result | {"bytes": taken, "core": core}), flush=True)
     os._exit(0)  # thousands of tokens need not be withdrawn one by one
@@ -190,7 +231,7 @@ def _check_known(arrived: int, known: int) -> None:
         os._exit(1)
 
 
-def bare(endpoint: str, expected: int, plants: int) -> None:
+def bare(endpoint: str, plants: int, expected: int) -> None:
     """Count what comes."""
     alone_on_a_core(0)
     bus = connect(BusConfig(endpoint=endpoint), "bare", StopSignal())
@@ -257,22 +298,15 @@ def row_of(plants: int) -> str:
     try:
         rates = {}
         for listener in ("bare", "monitor"):
-            arguments = (endpoint, expected, plants) if listener == "bare" else (endpoint, plants, expected, 0)
-            process = start_part(listener, *arguments)
-            source = start_part("publish", endpoint, plants, rows, 0)
+            process = start_part(listener, endpoint, plants, expected)
+            source = start_part("publish", endpoint, plants, rows)
             found = read_result(process)
             source.wait()
             rates[listener] = found["samples"] / found["cpu_s"]
-        live = start_part("monitor", endpoint, plants, -1, 1)
-        source = start_part("publish", endpoint, plants, KNOWN_ROWS + LATENCY_S // SIGNALS, plants)
-        delays = read_result(source)
-        live.kill()
-        p99 = f"{np.percentile(delays['delays_ms'], 99):9.1f} ms" if delays["delays_ms"] else f"{'–':>12}"
         alone = f"{found['bytes'] / 1000:9.1f} kB" if plants >= 100 else f"{'–':>12}"
         return (
             f"{plants:7,} {found['core']:13,.0f} {rates['monitor']:13,.0f} {rates['bare']:13,.0f} "
-            f"{100 * rates['monitor'] / rates['bare']:6.0f} % {alone} {p99} "
-            f"({len(delays['delays_ms'])} of {delays['out']})"
+            f"{100 * rates['monitor'] / rates['bare']:6.0f} % {alone}"
         )
     finally:
         hub.kill()
@@ -280,20 +314,14 @@ def row_of(plants: int) -> str:
 
 def main() -> None:
     """Measure and print."""
-    configure(logging.WARNING)
+    configure_log(logging.WARNING)
     if len(sys.argv) > 1 and sys.argv[1] in ("route", "publish", "monitor", "bare"):
+        parts: dict[str, Callable[..., None]] = {"route": route, "publish": publish, "monitor": monitor, "bare": bare}
         command, endpoint, *numbers = sys.argv[1:]
-        if command == "route":
-            route(endpoint)
-        elif command == "publish":
-            publish(endpoint, int(numbers[0]), int(numbers[1]), float(numbers[2]))
-        elif command == "monitor":
-            monitor(endpoint, int(numbers[0]), int(numbers[1]), bool(int(numbers[2])))
-        else:
-            bare(endpoint, int(numbers[0]), int(numbers[1]))
+        parts[command](endpoint, *map(int, numbers))
         return
-    print("samples a second of one core; p99 from sample to alarm at 1 sample/s a plant (alarms that came)")
-    print(f"{'plants':>7} {'without bus':>13} {'live':>13} {'bare':>13} {'ratio':>8} {'a plant':>12} {'p99':>12}")
+    print("samples a second of one core")
+    print(f"{'plants':>7} {'without bus':>13} {'live':>13} {'bare':>13} {'ratio':>8} {'a plant':>12}")
     for plants in [int(item) for item in sys.argv[1:]] or SIZES:
         print(row_of(plants), flush=True)
     print("goal: without bus >= 60,000; live >= 45, 50, 40 % of bare with 1, 100, 1,000; <= 130 kB a plant")

@@ -31,7 +31,6 @@ log = structlog.get_logger()
 
 NODE = "diagnosis"
 RECORDING = "record.mcap"  # the diagnosed recording, in the folder of its report
-DRAIN_TIMEOUT_S = 0.5
 
 
 class DiagnosisRunner:
@@ -119,7 +118,7 @@ def run(config: DiagnosisConfig, bus_config: BusConfig, _metrics_config: Metrics
             return
         try:
             log.info("diagnosing after alarms", plant=config.plant, after_min=config.after_min, out=config.out)
-            loop = EventLoop(node, bus, stop, drain_timeout_s=DRAIN_TIMEOUT_S)
+            loop = EventLoop(node, bus, stop, drain_timeout_s=0.5)
             loop.subscribe(*(keys.all_keys(config.plant, kind) for kind in (keys.SAMPLE, keys.ALARM)))
             bus.declare_token(keys.key(config.plant, keys.ALIVE, NODE))
             loop.run()

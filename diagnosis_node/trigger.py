@@ -19,13 +19,12 @@ from reactorwatch.contract.keys import DEFAULT_PLANT, check_plant
 from reactorwatch.contract.messages_pb2 import Alarm, Sample
 from reactorwatch.errors import positive
 from reactorwatch.records.record import MINUTE_NS, NEVER_NS
-from reactorwatch.runtime.node import Node
-from reactorwatch.runtime.setting_rules import MODEL_IS_PROCESS, OlderKeys, check_bounds
+from reactorwatch.runtime.bus import Node
+from reactorwatch.runtime.config import MODEL_IS_PROCESS, OlderKeys, check_bounds
 from recorder import RecordedMessage
 
 HIDDEN_STATES = frozenset(CODES[state] for state in OUT_OF_SIGHT)  # alarms that trigger no diagnosis
 NO_DATA = "silence/"  # start of the names of alarms about missing data, which no model explains
-MAX_SAMPLES = 300_000  # at any sampling rate
 TIMEOUT_NS = 60 * 10**9  # time without a sample after which the plant is considered stopped
 
 
@@ -84,7 +83,7 @@ class DiagnosisTrigger(Node):
         busy: Callable[[], bool],
     ) -> None:
         self._config, self._diagnose, self._busy = config, diagnose, busy
-        self._samples: deque[RecordedMessage] = deque(maxlen=MAX_SAMPLES)
+        self._samples: deque[RecordedMessage] = deque(maxlen=300_000)  # at any sampling rate
         self.waiting: Alarm | None = None
         self._suppressed_until_ns = -NEVER_NS
         self._timeout_ns = NEVER_NS

@@ -13,11 +13,10 @@ from pathlib import Path
 import structlog
 
 from monitor_node.causes import stage
-from monitor_node.charts import drift
+from monitor_node.charts import shift_and_drift as drift
 from monitor_node.config import MonitorConfig
 from monitor_node.core import COMMANDS
-from monitor_node.fleet.config import ONE_PLANT, FleetConfig
-from monitor_node.fleet.monitor import load_kinds, prepare
+from monitor_node.fleet import ONE_PLANT, FleetConfig, load_kinds, prepare
 from monitor_node.health import NODE
 from monitor_node.node import MonitorNode, instance_token
 from reactorwatch.contract import keys
@@ -26,14 +25,11 @@ from reactorwatch.records.write import make_folder
 from reactorwatch.runtime.bus import Bus
 from reactorwatch.runtime.config import BusConfig, MetricsConfig
 from reactorwatch.runtime.event_loop import EventLoop, StopSignal, stop_on_signals
-from reactorwatch.runtime.metrics import Metrics, serve_metrics
+from reactorwatch.runtime.http_pages import Metrics, serve_metrics
 from reactorwatch.runtime.node_main import main
 from reactorwatch.runtime.start import join, wait_ready
 
 log = structlog.get_logger()
-
-DRAIN_TIMEOUT_S = 0.5
-"""Time without messages after which a stopping monitor has received everything."""
 
 UNCACHED = (keys.HEALTH, keys.ALARM_KPIS)
 """Periodic messages of each plant; a cache of them would take more memory than all else of a plant of a fleet."""
@@ -100,20 +96,14 @@ def run(
 
 
 def watch(node: MonitorNode, bus: Bus, stop: StopSignal, history_s: float = 0.0) -> None:
-    """Run a monitor until it is asked to stop.
-
-    Args:
-        node: the monitor.
-        bus: an open bus.
-        stop: ends it.
-        history_s: age of the oldest earlier sample to receive.
-    """
+    """Run a monitor until it is asked to stop."""
     log.info("listening", plants=node.expression)
     loop = EventLoop(
         node,
         bus,
         stop,
-        drain_timeout_s=DRAIN_TIMEOUT_S,
+        # a stopping monitor has received everything after half a second without messages
+        drain_timeout_s=0.5,
         on_publish=node.metrics.on_publish if node.metrics is not None else None,
         on_backlog=partial(setattr, node, "is_behind"),
     )

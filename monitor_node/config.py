@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple,
 import msgspec
 
 from reactorwatch.contract.keys import DEFAULT_PLANT, check_plant
-from reactorwatch.description.find import find_process
-from reactorwatch.runtime.setting_rules import check_bounds
+from reactorwatch.description.read import find_process
+from reactorwatch.runtime.config import check_bounds
 from reactorwatch.spc.charts.base import Setting, SignalSetting
 from reactorwatch.spc.charts.catalogue import CHARTS, chart
+from reactorwatch.spc.charts.value_chart import ValueChart
 from reactorwatch.spc.run_length import check_rule
-from reactorwatch.spc.value_chart import FEWEST_SIGNALS, ValueChart
 
 CHART_SETTINGS = [setting for chart in CHARTS for setting in chart.settings if isinstance(setting, Setting)]
 CHART_SIGNALS = [setting for chart in CHARTS for setting in chart.settings if isinstance(setting, SignalSetting)]
@@ -78,10 +78,6 @@ DEFAULT_PRIORITIES: dict[str, PriorityName] = msgspec.convert(DEFAULT.watch.prio
 """Priorities where none are stated; the same object, so that it is recognised."""
 
 
-PERIOD_ERROR = 0.01
-"""Rows by which a training may be short of its minutes, since a sampling period is rounded to nanoseconds."""
-
-
 class TrainingLength(NamedTuple):
     """Duration of a training.
 
@@ -97,7 +93,8 @@ class TrainingLength(NamedTuple):
         """Number of rows of the training at a sampling period."""
         if self.minutes is None:
             return self.rows
-        return max(1, ceil(self.minutes / period_min - PERIOD_ERROR))
+        # a sampling period is rounded to nanoseconds
+        return max(1, ceil(self.minutes / period_min - 0.01))
 
 
 class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
@@ -225,7 +222,8 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
             )
         if isinstance(self.charts, DefaultCharts):
             count = 0 if self._may_have_equations else len(self.outputs)
-            usual = CHARTS_OF_DOZENS if count >= DOZENS else CHARTS_OF_MANY if count >= FEWEST_SIGNALS else USUAL_CHARTS
+            many = count >= ValueChart.fewest_signals
+            usual = CHARTS_OF_DOZENS if count >= DOZENS else CHARTS_OF_MANY if many else USUAL_CHARTS
             msgspec.structs.force_setattr(self, "charts", usual)
         if len(set(self.charts)) != len(self.charts) or not self.charts:
             raise ValueError(f"charts must be at least one chart, each once, got {self.charts}")

@@ -17,14 +17,13 @@ from google.protobuf.message import Message
 from monitor_node.alarms.annunciator import Annunciator, AnnunciatorMemory
 from monitor_node.alarms.commands import COMMANDS as ALARM_COMMANDS
 from monitor_node.alarms.commands import execute_command
-from monitor_node.checks.silence import SilenceCheck
+from monitor_node.checks.signal_checks import SilenceCheck
 from monitor_node.config import MonitorConfig
 from monitor_node.health import HEARD_AGAIN_NS, NODE, STALL_NS, Failures, ReceiveStats
 from monitor_node.ingest.intake import SampleIntake
 from monitor_node.ingest.rows import Row
 from monitor_node.ingest.sequence_check import SequenceCheck
 from monitor_node.learn.baseline import NO_VALUE
-from monitor_node.learn.model_update import BASELINE, LIST
 from monitor_node.learn.training_diagnosis import DiagnosisJob, Finding
 from monitor_node.monitor_state import (
     MonitorMemory,
@@ -34,13 +33,13 @@ from monitor_node.monitor_state import (
     open_state,
     seal_state,
 )
+from monitor_node.watch.baselines import BASELINE, LIST
 from monitor_node.watch.pipeline import PlantPipeline
 from monitor_node.watch.promise import PromiseStage
 from monitor_node.watch.promise_check import check_training
 from monitor_node.watched_process import order_inputs
 from reactorwatch.contract import keys
-from reactorwatch.contract.codec import Body, DecodeError, Encoded, Publication, decode, encode
-from reactorwatch.contract.commands import decode_command
+from reactorwatch.contract.codec import Body, DecodeError, Encoded, Publication, decode, decode_command, encode
 from reactorwatch.contract.messages_pb2 import Baseline, BaselineCommand, CommandReply, Health, Promise, Sample
 from reactorwatch.errors import InputError
 from reactorwatch.process.model import ProcessModel

@@ -8,10 +8,7 @@ from typing import NamedTuple, TypeVar
 
 from monitor_node.learn.training_diagnosis import FAILED, DiagnosisJob, Finding, diagnose_training
 from reactorwatch.limits import limits
-from reactorwatch.runtime.executors import ProcessExecutor
-from reactorwatch.runtime.jobs import Executor, Failed, one_line, run_job
-
-NICENESS = 10
+from reactorwatch.runtime.jobs import Executor, Failed, ProcessExecutor, one_line, run_job
 
 Item = TypeVar("Item")
 
@@ -30,7 +27,7 @@ def find_deviations(job: DiagnosisJob) -> Finding:
 
 def diagnose_beside(job: DiagnosisJob) -> Finding:
     """Diagnose a training in a process of its own, which gives way to the monitor."""
-    os.setpriority(os.PRIO_PROCESS, 0, max(NICENESS, os.getpriority(os.PRIO_PROCESS, 0)))
+    os.setpriority(os.PRIO_PROCESS, 0, max(10, os.getpriority(os.PRIO_PROCESS, 0)))
     return diagnose_training(job)
 
 
@@ -43,9 +40,6 @@ class DiagnosisWorker:
 
     A diagnosis at which two processes die has failed. An unfinished diagnosis is dropped when the program ends; the
     training's rows are still in the plant's state.
-
-    Args:
-        executor: runs the jobs; None: a process of this machine.
     """
 
     def __init__(self, executor: Executor | None = None) -> None:

@@ -21,9 +21,6 @@ HEARD_AGAIN_NS = 1_000_000
 STALL_NS = 1_000_000_000
 """Due work is done within a millisecond; a monitor this late was stalled, or its clock was set."""
 
-LONGEST_CAUSE = 300
-"""Characters of an exception's own text in a report; a value in it may be of any length."""
-
 MOST_GROUPS = 1000
 """Largest number of groups; tokens of further ones are ignored, as anyone may declare tokens."""
 
@@ -79,11 +76,6 @@ class Failures:
     def add(self, stage: str, error: Exception, cost: str) -> None:
         """Count an exception, and report it if it is the first from its line of code.
 
-        Args:
-            stage: the part of the work that failed.
-            error: the exception.
-            cost: consequence for the plant, as the end of a sentence.
-
         Raises:
             Exception: the exception, if it passes.
         """
@@ -95,7 +87,7 @@ class Failures:
         if origin in self._reported:
             return
         self._reported.add(origin)
-        cause = " ".join(str(error).split())[:LONGEST_CAUSE]
+        cause = " ".join(str(error).split())[:300]
         self.notes.append(f"error of this software in the stage {stage}: {origin}: {cause}; {cost}; please report it")
         self.tracebacks.append("".join(traceback.format_exception(error)))
 
@@ -133,10 +125,6 @@ class OtherMonitors:
 
     Two monitors of one plant raise every alarm twice, and both answer commands. Each group is logged once, with the
     first shared plant, and once more when its last monitor has gone.
-
-    Args:
-        own: liveliness token of this monitor.
-        plants: returns the plants of this monitor.
     """
 
     def __init__(self, own: str, plants: Callable[[], Collection[str]]) -> None:

@@ -6,73 +6,62 @@ state learned with other settings, or with another model of the plant, is refuse
 """
 
 from hashlib import blake2b
-from typing import Any, NamedTuple
+from typing import Any
 
 import msgspec
 
 from monitor_node.alarms.annunciator import AnnunciatorMemory
 from monitor_node.config import MonitorConfig
-from monitor_node.ingest.duplicates import AlignmentMemory
 from monitor_node.ingest.intake import IntakeMemory
+from monitor_node.ingest.rows import AlignmentMemory
 from monitor_node.watch.pipeline import PipelineMemory
 from reactorwatch.errors import InputError
 from reactorwatch.process.model import ProcessModel, fingerprint
 from reactorwatch.version import this_build
 
 DIGEST_BYTES = 16
-_VERSION_BYTES = 2
 
 
 class ForeignFileError(InputError):
     """The bytes are no stored state, not even a damaged one: the software must not rename or overwrite the file."""
 
 
-class Seal(NamedTuple):
-    """Header of one kind of stored state.
+MAGIC = b"reactorwatch monitor"
+VERSION = 9
+"""Version of the layout of the stored state."""
 
-    Attributes:
-        word: magic word, the first bytes.
-        version: version of the layout that is written.
-        name: name of the kind, for messages.
+
+def seal(body: bytes, version: int = VERSION) -> bytes:
+    """Seal a serialised state: magic word, version, digest and body."""
+    return MAGIC + version.to_bytes(2, "big") + _digest(body) + body
+
+
+def open_seal(data: bytes) -> bytes:
+    """Serialised state in sealed bytes.
+
+    Raises:
+        ForeignFileError: the bytes are no state of a monitor.
+        InputError: the state is truncated, damaged or of another version.
     """
-
-    word: bytes
-    version: int
-    name: str
-
-    def close(self, body: bytes) -> bytes:
-        """Seal a body: word, version, digest and body."""
-        return self.word + self.version.to_bytes(_VERSION_BYTES, "big") + _digest(body) + body
-
-    def open(self, data: bytes) -> bytes:
-        """Body of sealed bytes.
-
-        Raises:
-            ForeignFileError: the bytes are not a state of this kind.
-            InputError: the state is truncated, damaged or of another version.
-        """
-        head_bytes = len(self.word) + _VERSION_BYTES
-        head, body = data[:head_bytes], data[head_bytes + DIGEST_BYTES :]
-        is_intact = data[head_bytes : head_bytes + DIGEST_BYTES] == _digest(body)
-        if not head.startswith(self.word) or len(head) < head_bytes:
-            text = f"is no {self.name}: {len(data)} bytes that do not begin like one"
-            # A damaged or truncated header before an intact body, or the remains of a power failure: nothing or zeros.
-            is_ours = self.word.startswith(head[: len(self.word)]) or is_intact or not data.strip(b"\0")
-            raise InputError(text) if is_ours else ForeignFileError(text)
-        version = int.from_bytes(head[len(self.word) :], "big")
-        if version != self.version:
-            raise InputError(f"is the {self.name} in version {version}, this software reads {self.version}")
-        if not is_intact:
-            raise InputError(f"is a damaged {self.name}: its digest is another")
-        return body
+    name, head_bytes = "state of a monitor", len(MAGIC) + 2
+    head, body = data[:head_bytes], data[head_bytes + DIGEST_BYTES :]
+    is_intact = data[head_bytes : head_bytes + DIGEST_BYTES] == _digest(body)
+    if not head.startswith(MAGIC) or len(head) < head_bytes:
+        text = f"is no {name}: {len(data)} bytes that do not begin like one"
+        # A damaged or truncated header before an intact body, or the remains of a power failure: nothing or zeros.
+        is_ours = MAGIC.startswith(head[: len(MAGIC)]) or is_intact or not data.strip(b"\0")
+        raise InputError(text) if is_ours else ForeignFileError(text)
+    version = int.from_bytes(head[len(MAGIC) :], "big")
+    if version != VERSION:
+        raise InputError(f"is the {name} in version {version}, this software reads {VERSION}")
+    if not is_intact:
+        raise InputError(f"is a damaged {name}: its digest is another")
+    return body
 
 
 def _digest(body: bytes) -> bytes:
     return blake2b(body, digest_size=DIGEST_BYTES).digest()
 
-
-MAGIC = b"reactorwatch monitor"
-SEAL = Seal(MAGIC, 9, "state of a monitor")
 
 NOT_LEARNED_BY = frozenset({"process", "state_file", "state_every_s", "health_period_s", "diagnose_training"})
 """Settings that do not change what was learned; the model is identified by its equations, not by its file."""
@@ -82,12 +71,7 @@ TRAINING = ("training_min", "training_rows")
 
 
 class OtherSettingsError(InputError):
-    """The state is intact, but was learned with other settings; its alarms can be used.
-
-    Args:
-        text: the difference.
-        alarms: memory of the alarms.
-    """
+    """The state is intact, but was learned with other settings; its alarms can be used."""
 
     def __init__(self, text: str, alarms: AnnunciatorMemory) -> None:
         super().__init__(text)
@@ -137,13 +121,7 @@ class MonitorState(MonitorMemory, kw_only=True):
 
 
 def learning_settings(config: MonitorConfig, model: ProcessModel | None, *, points: bool) -> dict[str, Any]:
-    """Settings that must be equal to resume from a state.
-
-    Args:
-        config: settings of the monitor.
-        model: process model.
-        points: see `Monitor`.
-    """
+    """Settings that must be equal to resume from a state."""
     fields = {field: value for field, value in msgspec.structs.asdict(config).items() if field not in NOT_LEARNED_BY}
     for name in TRAINING:
         if fields[name] is None:
@@ -157,22 +135,18 @@ def learning_settings(config: MonitorConfig, model: ProcessModel | None, *, poin
 
 def seal_state(state: MonitorState, settings: dict[str, Any]) -> bytes:
     """Serialise and seal a state, with the settings of its training (see `learning_settings`)."""
-    return SEAL.close(msgspec.structs.replace(state, settings=settings, build=this_build()).to_bytes())
+    return seal(msgspec.structs.replace(state, settings=settings, build=this_build()).to_bytes())
 
 
 def open_state(data: bytes, settings: dict[str, Any]) -> MonitorState:
     """Open a sealed state.
-
-    Args:
-        data: bytes from `seal_state`.
-        settings: see `learning_settings`.
 
     Raises:
         ForeignFileError: the bytes were never a state, or are one of another plant.
         InputError: the state is damaged, or of another version.
         OtherSettingsError: the state was learned with other settings.
     """
-    body = SEAL.open(data)
+    body = open_seal(data)
     try:
         state = MonitorState.from_bytes(body)
     except ValueError as error:

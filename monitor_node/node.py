@@ -6,27 +6,26 @@ from pathlib import Path
 
 import structlog
 
-from monitor_node.alarms.incidents import is_empty
+from monitor_node.alarms.alarms import is_empty
+from monitor_node.alarms.commands import CommandRateLimiter, sender_name
 from monitor_node.causes import stage
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from monitor_node.diagnosis_worker import DiagnosisWorker
-from monitor_node.fleet.config import ONE_PLANT, FleetConfig, parse_shard
-from monitor_node.fleet.monitor import FleetMonitor, PlantKind, load_kinds
+from monitor_node.fleet import ONE_PLANT, FleetConfig, FleetMonitor, PlantKind, load_kinds, parse_shard
 from monitor_node.health import NODE, OtherMonitors
 from monitor_node.learn.training_diagnosis import read_equations
-from monitor_node.storage.state_files import RESUMED, StateStore
+from monitor_node.state_files import RESUMED, StateStore
 from reactorwatch.contract import keys
-from reactorwatch.contract.alarm_text import state_word
 from reactorwatch.contract.codec import Encoded, Publication
 from reactorwatch.contract.messages_pb2 import Alarm, AlarmKpis, Baseline, CommandReply, Health, Incident
 from reactorwatch.errors import InputError
 from reactorwatch.records.write import make_folder
+from reactorwatch.runtime.acl import is_query
 from reactorwatch.runtime.bus import Bus
-from reactorwatch.runtime.metrics import Metrics
-from reactorwatch.runtime.security.acl import is_query
-from reactorwatch.runtime.security.command_rate import CommandRateLimiter, sender_name
+from reactorwatch.runtime.http_pages import Metrics
 from reactorwatch.runtime.start import instance_name
+from reactorwatch.sentences.alarm import state_word
 
 log = structlog.get_logger()
 
@@ -37,15 +36,6 @@ Such a step takes some hundredths of a second, at most a few tenths; samples are
 
 PREPARED = object()
 """Marks the end of the preparation."""
-
-LOG_INTERVAL_NS = 10_000_000_000
-"""Interval between logs of what the monitors of a fleet have to say."""
-
-MOST_TOKENS = 200
-"""Plants with a liveliness token. Zenoh's time for one grows with their number: 10,000 take minutes."""
-
-MOST_STORED = 20
-"""Plants whose state is stored at a time: half a millisecond each. With thousands, each is stored less often."""
 
 
 class MonitorNode(FleetMonitor):
@@ -84,7 +74,7 @@ class MonitorNode(FleetMonitor):
         kinds: tuple[PlantKind, ...] | None = None,
     ) -> None:
         self._fleet, self.metrics = fleet, metrics
-        self.expression = plants_of(config, fleet)
+        self.expression = fleet.plants or f"{keys.ROOT}/{config.plant}"
         self.token = token or instance_token(config, fleet)
         self.preparation: Iterator[None] | None = None
         self.resumed = False
@@ -144,7 +134,7 @@ class MonitorNode(FleetMonitor):
 
     def _declare_token(self, plant: str) -> None:
         token = keys.key(plant, keys.ALIVE, NODE)
-        if self._bus is not None and len(self._tokens) < MOST_TOKENS:
+        if self._bus is not None and len(self._tokens) < 200:
             self._tokens.add(token)
             self._bus.declare_token(token)
 
@@ -213,7 +203,7 @@ class MonitorNode(FleetMonitor):
                     self.preparation = chain(self.preparation or (), extended)
         publications = self._keep(super().on_tick(now_ns), now_ns)
         if self.is_single or now_ns >= self._report_ns:
-            self._report_ns = now_ns + LOG_INTERVAL_NS
+            self._report_ns = now_ns + 10_000_000_000
             self._log_notes()
             self._log_rejects(now_ns)
         return publications
@@ -264,7 +254,8 @@ class MonitorNode(FleetMonitor):
         if not self._round and not 0 <= now_ns - self._round_ns < self._every_ns:
             self._round, self._round_ns = self.plants, now_ns
         checked = 0
-        while self._round and checked < MOST_STORED and self._states.has_room:
+        # half a millisecond each; with thousands of plants, each is stored less often
+        while self._round and checked < 20 and self._states.has_room:
             plant, checked = self._round.pop(), checked + 1
             monitor = self._monitors.get(plant)
             if monitor is not None and monitor.memory.received != self._stored_at.get(plant):
@@ -364,11 +355,6 @@ class MonitorNode(FleetMonitor):
         if self.evictions > self._evicted_logged:
             self._evicted_logged = self.evictions
             log.warning("unverified plants without messages were evicted", so_far=self.evictions)
-
-
-def plants_of(config: MonitorConfig, fleet: FleetConfig) -> str:
-    """Key expression of the plants of a fleet, or of the one plant of the monitor's settings."""
-    return fleet.plants or f"{keys.ROOT}/{config.plant}"
 
 
 def instance_token(config: MonitorConfig, fleet: FleetConfig) -> str:

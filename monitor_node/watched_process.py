@@ -1,6 +1,12 @@
-"""Process that a monitor watches: its signals and equations in the settings of the monitor."""
+"""Process that a monitor watches: its signals, their possible ranges, and its equations, in the monitor's settings.
+
+A value beyond the bounds of a state or an input, such as 9999 of a broken wire or -999 of a converter, is no
+measurement. Filters, charts and the search for causes do not use it. Near a bound of the model a sensor may read a
+little beyond it, so the model's bounds are widened.
+"""
 
 from collections.abc import Mapping
+from math import inf, isfinite
 from typing import Any, NamedTuple
 
 import msgspec
@@ -13,10 +19,10 @@ from monitor_node.config import (
     WITHOUT_EQUATIONS,
     MonitorConfig,
 )
-from reactorwatch.description.find import find_process
 from reactorwatch.description.process import Process, Signal
+from reactorwatch.description.read import find_process
 from reactorwatch.errors import InputError, describe_unknown
-from reactorwatch.process.model import ProcessModel
+from reactorwatch.process.model import ProcessModel, Variable
 from reactorwatch.units import conversion
 
 
@@ -137,14 +143,28 @@ def order_inputs(config: MonitorConfig, model: ProcessModel | None) -> MonitorCo
     return msgspec.structs.replace(config, inputs=model.input_names)
 
 
-def limit_training(config: MonitorConfig, rows: int | None, *, is_stated: bool | None = None) -> MonitorConfig:
-    """Limit a training that is not stated to a third of a record; that of the reactor stays as it is.
+def judging_equations(config: MonitorConfig, model: ProcessModel | None) -> ProcessModel | None:
+    """Equations by which a plant is judged, as the settings ask for it; None: by none.
 
-    Args:
-        config: settings of a monitor.
-        rows: number of rows of the record; None: unknown.
-        is_stated: True if the length is stated; None: as the settings say.
+    Raises:
+        InputError: the settings ask for equations that do not fit the signals.
     """
+    if config.reference in ("black-box", "arx") or (model is None and config.process == WITHOUT_EQUATIONS):
+        return None
+    given, model = model is not None, model or DEFAULT.require_model()
+    if config.inputs == model.input_names and set(config.outputs) <= set(model.output_names):
+        return model
+    if config.reference == "auto" and not given:
+        return None
+    raise InputError(
+        f"reference 'equations' needs the signals of {model.name}, inputs {', '.join(model.input_names)} and outputs "
+        f"of {', '.join(model.output_names)}, got {', '.join(config.inputs) or 'none'} and "
+        f'{", ".join(config.outputs)}; set reference = "arx"'
+    )
+
+
+def limit_training(config: MonitorConfig, rows: int | None, *, is_stated: bool | None = None) -> MonitorConfig:
+    """Limit a training that is not stated to a third of a record; that of the reactor stays as it is."""
     stated = _states_training(config) if is_stated is None else is_stated
     length = config.training_length
     if stated or rows is None or length.minutes is not None:
@@ -154,3 +174,79 @@ def limit_training(config: MonitorConfig, rows: int | None, *, is_stated: bool |
 
 def _states_training(config: MonitorConfig) -> bool:
     return config.training_min is not None or config.training_rows is not None
+
+
+class SignalRange(NamedTuple):
+    """Possible values of a signal.
+
+    Attributes:
+        lower: smallest value.
+        upper: largest value.
+        unit: unit of both.
+    """
+
+    lower: float = -inf
+    upper: float = inf
+    unit: str = ""
+
+    @property
+    def is_bounded(self) -> bool:
+        """True if the range is limited."""
+        return self.lower > -inf or self.upper < inf
+
+
+ANY = SignalRange()
+"""Range of a signal without known bounds."""
+
+
+def signal_ranges(model: ProcessModel | None, signals: tuple[str, ...]) -> list[SignalRange]:
+    """Range of each signal."""
+    if model is None:
+        return [ANY] * len(signals)
+    states = {state.name: state for state in model.states}
+    variables = {variable.name: variable for variable in model.inputs}
+    for output in model.outputs:
+        if output.expression.is_symbolic() and output.expression.name() in states:
+            variables[output.name] = states[output.expression.name()]
+    return [_widen(variables[signal]) if signal in variables else ANY for signal in signals]
+
+
+def stated_ranges(config: MonitorConfig) -> list[SignalRange]:
+    """Range of each signal of a row as the settings state it, without a margin."""
+    ranges = []
+    for signal in config.signals:
+        lower, upper = config.bounds.get(signal, (-inf, inf))
+        # a value at a bound may be beyond it after a conversion of units
+        rounding = 1e-9 * (upper - lower) if isfinite(upper - lower) else 0.0
+        ranges.append(SignalRange(lower - rounding, upper + rounding, config.units.get(signal, "")))
+    return ranges
+
+
+def possible_ranges(config: MonitorConfig, model: ProcessModel | None) -> list[SignalRange]:
+    """Range of each signal of a row: as stated, and within that of the model."""
+    pairs = zip(stated_ranges(config), signal_ranges(model, config.signals), strict=True)
+    return [
+        SignalRange(max(stated.lower, given.lower), min(stated.upper, given.upper), given.unit or stated.unit)
+        for stated, given in pairs
+    ]
+
+
+def input_bounds(config: MonitorConfig, model: ProcessModel | None) -> list[SignalRange]:
+    """Bounds at which each input is saturated: as stated, else those of the model."""
+    variables = {} if model is None else {variable.name: variable for variable in model.inputs}
+    bounds = []
+    for name in config.inputs:
+        variable = variables.get(name)
+        unit = config.units.get(name, "") if variable is None else variable.unit
+        if name in config.bounds:
+            bounds.append(SignalRange(*config.bounds[name], unit))
+        else:
+            bounds.append(ANY if variable is None else SignalRange(variable.lower, variable.upper, unit))
+    return bounds
+
+
+def _widen(variable: Variable) -> SignalRange:
+    span = variable.upper - variable.lower
+    # for noise and bias of a sensor
+    margin = 0.05 * span if isfinite(span) else 0.0
+    return SignalRange(variable.lower - margin, variable.upper + margin, variable.unit)

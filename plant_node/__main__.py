@@ -14,7 +14,7 @@ from reactorwatch.contract.codec import Publication
 from reactorwatch.runtime.bus import Bus
 from reactorwatch.runtime.config import BusConfig, MetricsConfig
 from reactorwatch.runtime.event_loop import EventLoop, StopSignal, stop_on_signals
-from reactorwatch.runtime.metrics import Metrics, serve_metrics
+from reactorwatch.runtime.http_pages import Metrics, serve_metrics
 from reactorwatch.runtime.node_main import main
 from reactorwatch.runtime.start import instance_name, join, wait_alive
 

@@ -18,7 +18,7 @@ from reactorwatch.process.fault import FaultSpecification, parse_fault
 from reactorwatch.process.library.cstr_operation import LevelControl, TemperatureControl
 from reactorwatch.process.model import Extension, ProcessModel
 from reactorwatch.process.operation import Controller, InputLevels
-from reactorwatch.runtime.setting_rules import MODEL_IS_PROCESS, OlderKeys, check_bounds
+from reactorwatch.runtime.config import MODEL_IS_PROCESS, OlderKeys, check_bounds
 from reactorwatch.units import conversion
 
 

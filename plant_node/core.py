@@ -21,7 +21,7 @@ from plant_node.config import PlantConfig, ProcessSettings, to_model_unit
 from plant_node.instruments import ControlLoop, ProcessNoise, check_controller, check_set_point, close_loops
 from plant_node.scenario import Scenario, seed_of_input
 from reactorwatch.arrays import Array
-from reactorwatch.codegen.array_function import ArrayFunction
+from reactorwatch.codegen.compiled_function import ArrayFunction
 from reactorwatch.description.process import Process
 from reactorwatch.errors import InputError, prefix_errors
 from reactorwatch.process.effect import TIMING

@@ -11,8 +11,7 @@ from math import isinf
 from plant_node.config import PlantConfig
 from plant_node.core import FaultChange, Plant, Row
 from reactorwatch.contract import keys
-from reactorwatch.contract.codec import DecodeError, Encoded, Publication
-from reactorwatch.contract.commands import decode_command
+from reactorwatch.contract.codec import DecodeError, Encoded, Publication, decode_command
 from reactorwatch.contract.messages_pb2 import (
     ClearFault,
     CommandReply,
@@ -25,8 +24,8 @@ from reactorwatch.contract.messages_pb2 import (
 )
 from reactorwatch.errors import InputError
 from reactorwatch.process.fault import parse_fault
-from reactorwatch.records.record import to_time_ns
-from reactorwatch.runtime.node import Node
+from reactorwatch.records.record import MINUTE_NS, to_time_ns
+from reactorwatch.runtime.bus import Node
 from reactorwatch.version import version
 
 NODE = "plant"
@@ -38,8 +37,6 @@ COMMANDS: dict[str, type[SetInput | InjectFault | ClearFault]] = {
 """The message type of each command."""
 
 BATCH = 200  # rows published before the loop serves commands again
-BEHIND_S = 1.0  # a longer lag is logged
-LOG_INTERVAL_NS = 60_000_000_000
 
 
 class PlantNode(Node):
@@ -58,7 +55,7 @@ class PlantNode(Node):
         self._started_ns: int | None = None
         self._zero_ns = config.zero_ns
         self._health_due_ns = 0
-        self._lag_logged_ns = -LOG_INTERVAL_NS
+        self._lag_logged_ns = -MINUTE_NS
         self._had_trouble = False
         self._lag_ns = 0
         self._published = 0
@@ -174,7 +171,7 @@ class PlantNode(Node):
         if trouble is not None and not self._had_trouble:
             self._log(f"{trouble}: the state is held, samples are marked bad")
         self._had_trouble = trouble is not None
-        if self._lag_ns > BEHIND_S * 1e9 and now_ns - self._lag_logged_ns >= LOG_INTERVAL_NS:
+        if self._lag_ns > 1e9 and now_ns - self._lag_logged_ns >= MINUTE_NS:  # a second, once a minute
             self._lag_logged_ns = now_ns
             self._log(f"behind its pace by {self._lag_ns / 1e9:.1f} s; no row is left out")
 

@@ -9,14 +9,18 @@ from msgspec.structs import replace as with_changes
 from plant_node.config import PlantConfig, fit_settings
 from plant_node.core import Plant
 from plant_node.scenario import FromFile, HeldRecord, Scenario
-from reactorwatch.description.find import ProcessChoice, build_process, find_process
 from reactorwatch.description.process import Process
-from reactorwatch.description.read import convert_to_process
+from reactorwatch.description.read import (
+    ProcessChoice,
+    build_process,
+    convert_to_process,
+    find_process,
+    read_extended_model,
+)
 from reactorwatch.process.effect import TIMING
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.read import SignalColumn, read_table
 from reactorwatch.records.record import Record
-from reactorwatch.runtime.model_file import read_extended_model
 
 
 def plant_from(

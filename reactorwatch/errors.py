@@ -12,7 +12,7 @@ class InputError(ValueError):
     """Input that cannot be used: a file, an option, a setting.
 
     Its text is one line that names the thing, the rule and the value, and the cure if it is known. Commands print
-    that line and end with `exit_code`; every other error is a fault of this software (`runtime/crash.py`).
+    that line and end with `exit_code`; every other error is a fault of this software (`runtime/node_main.py`).
     """
 
     exit_code: ClassVar[int] = 2
@@ -43,7 +43,7 @@ _PASSING = frozenset(
 def is_passing(error: BaseException | None) -> bool:
     """True if an error, or a cause of it, is a state of the machine that can pass: a full disk, a port that is taken.
 
-    At its start a node waits until it has passed (`runtime/retry.py`); other errors are for a person to mend.
+    At its start a node waits until it has passed (`runtime/event_loop.py`); other errors are for a person to mend.
     """
     while error is not None:
         if isinstance(error, OSError) and error.errno in _PASSING:

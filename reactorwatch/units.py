@@ -10,7 +10,7 @@ from typing import Any
 
 from reactorwatch.errors import InputError
 
-LONGEST_UNIT = 60
+LONGEST_UNIT = 60  # letters: twice those of any unit in use
 
 _SPELLINGS = {"1": "dimensionless", "-": "dimensionless", "": "dimensionless"}
 

@@ -17,8 +17,6 @@ COMMIT = "[0-9a-f]{7,64}"
 """Pattern of a commit."""
 
 _PACKAGE = Path(__file__).parent
-_SHORT = 12
-"""Digits of a commit in texts, as many as tell the commits of the largest public repositories apart."""
 
 
 @cache
@@ -49,7 +47,7 @@ def describe_build(version: str, commit: str) -> str:
     >>> describe_build("1.2.0", "0123456789abcdef0123456789abcdef01234567")
     '1.2.0 (commit 0123456789ab)'
     """
-    return f"{version} (commit {commit[:_SHORT]})"
+    return f"{version} (commit {commit[:12]})"  # tells the commits of the largest public repositories apart
 
 
 def this_build() -> str:

@@ -9,16 +9,13 @@ from reactorwatch.contract import keys
 from reactorwatch.errors import InputError, is_passing
 from reactorwatch.runtime.config import BusConfig, MetricsConfig
 from reactorwatch.runtime.event_loop import EventLoop, StopSignal, stop_on_signals
-from reactorwatch.runtime.metrics import Metrics, serve_metrics
+from reactorwatch.runtime.http_pages import Metrics, serve_metrics
 from reactorwatch.runtime.node_main import main
 from reactorwatch.runtime.start import instance_name, join, wait_ready
 from recorder.config import RecorderConfig
 from recorder.core import COMMANDS, NODE
 from recorder.node import RecorderNode
 from recorder.recording_files import RecordingFiles, file_names, free_bytes
-
-HISTORY_MARGIN_NS = 10_000_000_000
-"""Largest delay from publication, which dates a message on the bus, to receipt, which dates it in a file."""
 
 
 def run(
@@ -54,7 +51,8 @@ def record(
     Raises:
         InputError: as `run`.
     """
-    history_ns = round(bus_config.history_s * 1e9) + HISTORY_MARGIN_NS
+    # with a margin for the delay from publication, which dates a message on the bus, to receipt, which dates it here
+    history_ns = round((bus_config.history_s + 10.0) * 1e9)
 
     def start() -> tuple[RecordingFiles, RecorderNode]:
         files, start_ns = RecordingFiles(config), time.time_ns()

@@ -4,15 +4,12 @@ Segments allow to draw a recording larger than memory and a run that has not end
 context of earlier segments that panels need. After the plant's clock stepped back, times are shifted to follow the
 earlier run (`RunSplitter.continuous_ns`). Numbers are collected in arrays, which take a few bytes a number instead of
 an object, and are cleared after each segment.
-
-Signals have meanings and roles from their process, or from the catalogue of processes.
 """
 
 import sys
 from array import array
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
-from functools import cache
 from operator import attrgetter
 from typing import Any, NamedTuple
 
@@ -22,12 +19,10 @@ from numpy.typing import NDArray
 
 from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
-from reactorwatch.contract.alarm_text import NewSuspects
 from reactorwatch.contract.codec import Encoded
+from reactorwatch.contract.suspects import NewSuspects
 from reactorwatch.description.process import Process
 from reactorwatch.errors import InputError
-from reactorwatch.process import MODELS
-from reactorwatch.process.model import ProcessModel
 from reactorwatch.units import conversion
 from recorder import RecordedMessage
 from recorder.samples import RunSplitter, content_of, measured_value
@@ -179,63 +174,6 @@ class RunColumns:
     def zero_ns(self) -> int:
         """Time that minutes count from."""
         return self.first_ns if self.given_zero_ns is None else self.given_zero_ns
-
-
-def signal_title(name: str, unit: str, process: Process | None = None) -> str:
-    """Name of a signal, with its meaning if its process has a variable of that name.
-
-    Without a process, it is any of the catalogue whose variable has this unit, too.
-    """
-    for model in _models_of(process):
-        for item in (*model.inputs, *model.states):
-            if item.name == name and (item.unit == unit or process is not None):
-                return f"{name}: {item.meaning}" if item.meaning else name
-    return name
-
-
-def signal_roles(units: Mapping[str, str], process: Process | None = None) -> dict[str, str]:
-    """Roles of signals by name: those of the process in its order, then all others as outputs.
-
-    Args:
-        units: units of the signals, by name; empty: unknown.
-        process: process of the signals; None: the one of the catalogue that has all of them, or all of whose signals
-            are there.
-    """
-    if process is not None:
-        roles = {signal.name: signal.role for signal in process.signals}
-    elif (model := find_model(units) or _find_model_with(units)) is not None:
-        roles = {name: "input" if name in model.input_names else "output" for name in model.units}
-    else:
-        roles = {}
-    known = {name: role for name, role in roles.items() if name in units}
-    return known | {name: "output" for name in units if name not in roles}
-
-
-def find_model(units: Mapping[str, str], process: Process | None = None) -> ProcessModel | None:
-    """Equations, of the catalogue without a process, whose inputs and outputs are all present with the same units."""
-    return next((model for model in _models_of(process) if model.units.items() <= units.items()), None)
-
-
-def _find_model_with(units: Mapping[str, str]) -> ProcessModel | None:
-    """Model of the catalogue that has all of the signals, none of them in another unit."""
-    for model in _models():
-        if all(name in model.units and unit in ("", model.units[name]) for name, unit in units.items()):
-            return model
-    return None
-
-
-def _models_of(process: Process | None) -> tuple[ProcessModel, ...]:
-    """Equations of a process; without its own, those of the catalogue under its name."""
-    if process is None:
-        return _models()
-    if process.model is not None:
-        return (process.model,)
-    return tuple(model for model in _models() if model.name == process.name)
-
-
-@cache
-def _models() -> tuple[ProcessModel, ...]:
-    return tuple(build() for build in MODELS)
 
 
 SEGMENT_MESSAGES = 100_000

@@ -7,12 +7,10 @@ import msgspec
 
 from reactorwatch.contract import keys
 from reactorwatch.records.file_format import GUESS, FileFormat
-from reactorwatch.runtime.setting_rules import check_bounds
+from reactorwatch.runtime.config import check_bounds
 from recorder.keep import MAX_KEYS, Fsync
 
 MB = 1_000_000
-MAX_FLUSH_S = 1.0
-MIN_KEYS = 100
 
 
 class RecorderConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -57,7 +55,7 @@ class RecorderConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     keep_mb: float = math.inf
     keep_days: float = math.inf
     keep_files: float = math.inf
-    most_keys: Annotated[int, msgspec.Meta(ge=MIN_KEYS, le=MAX_KEYS)] = MAX_KEYS
+    most_keys: Annotated[int, msgspec.Meta(ge=100, le=MAX_KEYS)] = MAX_KEYS
     black_box_min: float = 10.0
     resume_mb: float = 50.0
     linger_s: float = 0.5
@@ -71,8 +69,8 @@ class RecorderConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             value = getattr(self, name)
             if not 0.0 < value < math.inf:
                 raise ValueError(f"{name} must be positive and finite, got {value!r}")
-        if self.flush_period_s > MAX_FLUSH_S:
-            raise ValueError(f"flush_period_s must be at most {MAX_FLUSH_S:g}, got {self.flush_period_s!r}")
+        if self.flush_period_s > 1.0:  # the promise about a recorder that is killed
+            raise ValueError(f"flush_period_s must be at most 1, got {self.flush_period_s!r}")
         for name in ("rotate_min", "rotate_mb", "keep_mb", "keep_days"):
             if not getattr(self, name) > 0.0:
                 raise ValueError(f"{name} must be positive, or inf, got {getattr(self, name)!r}")

@@ -19,14 +19,23 @@ from google.protobuf.message import Message
 from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.alarm_states import CODES, Event, State, next_state
-from reactorwatch.contract.codec import MAX_PAYLOAD, DecodeError, Encoded, Publication, decode, encoding_of
-from reactorwatch.contract.commands import check_signature, decode_command
+from reactorwatch.contract.codec import (
+    MAX_PAYLOAD,
+    DecodeError,
+    Encoded,
+    Publication,
+    check_signature,
+    decode,
+    decode_command,
+    encoding_of,
+)
 from reactorwatch.contract.messages_pb2 import AlarmCommand, CommandReply, ListAlarms
 from reactorwatch.errors import InputError
+from reactorwatch.records.record import MINUTE_NS
 from reactorwatch.runtime.reorder_buffer import Gap
 from reactorwatch.version import version
 from recorder import Channel, StoredMessage
-from recorder.keep import channel_of
+from recorder.keep import MAX_KEYS, channel_of
 from recorder.samples import SequenceCounter
 
 log = structlog.get_logger()
@@ -45,17 +54,8 @@ COMMANDS: Mapping[str, type[Message]] = {
 """Message type by command."""
 
 NODE = "recorder"
-MAX_COUNTERS = 60_000
-"""Keys of samples whose sequence numbers are checked; beyond it the least recently used key is evicted."""
-NO_ROOM_NS = 60_000_000_000
-"""The alarm about keys clears after this time without a rejected message."""
-LOG_INTERVAL_NS = 60_000_000_000
-MAX_QUOTE = 200
-"""Characters of a key in a text: publishers control it."""
 
 _SAMPLE = encoding_of(messages.Sample)
-_NO_SAMPLE = messages.QUALITY_UNSPECIFIED  # which protobuf reads out of bytes that hold something else
-_LARGEST_COUNT = 2**64 - 1  # a sequence number may be any nonsense; the sum of what it skips must still fit its field
 
 
 class ReceivedMessage(StoredMessage, gc=False):
@@ -67,11 +67,6 @@ class ReceivedMessage(StoredMessage, gc=False):
 def fingerprint(key: str, payload: bytes) -> int:
     """Hash of a message; differs between processes."""
     return hash((key, payload))
-
-
-RENEWED_EVERY, LARGEST_REUSED = 1_000, 256
-"""A message that is decoded into another frees nothing that it held: so a new one is used after as many messages, and
-for a payload of more bytes."""
 
 
 class Recorder:
@@ -132,7 +127,8 @@ class Recorder:
             return None if is_recorded else self._receive_other(key, payload, encoding, received_ns)
         counters[key] = counted
         channel, counter = counted
-        if not self._received % RENEWED_EVERY or len(payload) > LARGEST_REUSED:
+        # a message that is decoded into another frees nothing that it held: a new one for some, and for large payloads
+        if not self._received % 1000 or len(payload) > 256:
             self._sample = messages.Sample()
         sample = self._sample
         try:
@@ -165,7 +161,7 @@ class Recorder:
         time_ns, sequence = getattr(decoded, "time_ns", received_ns), 0
         if isinstance(decoded, messages.Sample):
             sequence = decoded.sequence
-            if time_ns >= 0 and decoded.quality == _NO_SAMPLE:
+            if time_ns >= 0 and not decoded.quality:  # protobuf reads 0 out of bytes that hold something else
                 self._refused["payload"] += 1
         if time_ns < 0:
             time_ns = self._correct_time(received_ns)
@@ -177,11 +173,14 @@ class Recorder:
         return received_ns
 
     def _new_counter(self, key: str) -> tuple[Channel, SequenceCounter] | None:
-        """Channel and counter of a new key of samples; None if it is not one of the product."""
+        """Channel and counter of a new key of samples; None if it is not one of the product.
+
+        With a counter for each of `MAX_KEYS` keys, the least recently used one is evicted.
+        """
         channel = channel_of(key, _SAMPLE, is_readable=True)
         if not channel.is_product:
             return None
-        if len(self._counters) >= MAX_COUNTERS:
+        if len(self._counters) >= MAX_KEYS:
             _, evicted = self._counters.pop(next(iter(self._counters)))
             self._evicted.lost += evicted.lost
             self._evicted.duplicated += evicted.duplicated
@@ -216,9 +215,9 @@ class Recorder:
         """Count a message whose key has no channel in the file, and raise the alarm."""
         self._refused["too many keys"] += 1
         self._no_room_ns = now_ns
-        key = received.channel.key[:MAX_QUOTE]
+        key = received.channel.key[:200]  # publishers control it
         kind = "of this software" if received.channel.is_product else "of other programs"
-        if self._logged_ns is None or now_ns - self._logged_ns >= LOG_INTERVAL_NS:
+        if self._logged_ns is None or now_ns - self._logged_ns >= MINUTE_NS:
             self._logged_ns = now_ns
             log.warning("not recorded: too many keys", example=key, keys=kind, messages=self._refused["too many keys"])
         if self.alarms.is_active(KEYS_ALARM):
@@ -227,8 +226,8 @@ class Recorder:
         return [self.alarms.raise_alarm(KEYS_ALARM, text, now_ns), self.health(now_ns)]
 
     def clear_keys_alarm(self, now_ns: int) -> list[Publication]:
-        """Clear the alarm about keys once no message was rejected for `NO_ROOM_NS`."""
-        if not self.alarms.is_active(KEYS_ALARM) or now_ns - self._no_room_ns < NO_ROOM_NS:
+        """Clear the alarm about keys once no message was rejected for a minute."""
+        if not self.alarms.is_active(KEYS_ALARM) or now_ns - self._no_room_ns < MINUTE_NS:
             return []
         text = f"everything is recorded again; {self._refused['too many keys']} messages are missing so far"
         return [self.alarms.clear(KEYS_ALARM, text, now_ns)]
@@ -263,7 +262,8 @@ class Recorder:
             phase=phase,
             uptime_s=(now_ns - self._start_ns) / 1e9,
             received=self._received,
-            lost=min(sum(check.lost for check in checks) + self._unrecovered, _LARGEST_COUNT),
+            # a sequence number may be any nonsense, and the sum of what it skips must fit the field
+            lost=min(sum(check.lost for check in checks) + self._unrecovered, 2**64 - 1),
             duplicated=sum(check.duplicated for check in checks),
             out_of_order=sum(check.out_of_order for check in checks),
             refused=self._refused.total(),

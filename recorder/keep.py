@@ -7,9 +7,9 @@ A recorder that is killed loses what it had not handed to the operating system, 
 that loses its power loses what was not synced. The sync period trades safety against disk load.
 
 Retention selects the oldest recordings for deletion until the others are within limits. Its times are confirmed times
-(see `files.ages`): setting a clock deletes nothing. The black box keeps an interval around each alarm, in times of
-receipt. An alarm that is raised before the current interval ends extends it, because both belong to one event. An
-interval has a largest length; the next alarm after it starts a new one.
+(see `Ages`): setting a clock deletes nothing. The black box keeps an interval around each alarm, in times of receipt.
+An alarm that is raised before the current interval ends extends it, because both belong to one event. An interval has a
+largest length; the next alarm after it starts a new one.
 
 MCAP numbers the channels of a file with 16 bits, and the index grows with each channel. So the number of keys in a file
 is bounded. Keys with messages of the product have nearly all channels. Other keys and encodings have a small share of
@@ -34,8 +34,10 @@ from google.protobuf.message import Message
 
 from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
-from reactorwatch.records.record import NEVER_NS
+from reactorwatch.records.record import MINUTE_NS, NEVER_NS
 from recorder import Channel, RecordedMessage
+
+SECOND_NS = 1_000_000_000
 
 ENDING = ".mcap"
 _MOMENT = "%Y%m%dT%H%M%SZ"
@@ -69,18 +71,15 @@ class FileNames:
             return cls(out.parent, out.stem, dated=False)
         return cls(out, plant, dated=True)
 
-    def first(self, now: datetime) -> Path:
-        """Name of a first file that is started at `now`."""
-        return self.folder / f"{self._stem(now)}{ENDING}"
-
-    def next(self, now_ns: int, existing: Iterable[str]) -> Path:
+    def next(self, now_ns: int, existing: Iterable[str] = ()) -> Path:
         """Name of the next file, with a number above all that exist, so that no name of a deleted file is reused.
 
         Args:
             now_ns: start time of the file.
             existing: names of files in the folder.
         """
-        stem = self._stem(datetime.fromtimestamp(now_ns // 1_000_000_000, UTC))
+        started = datetime.fromtimestamp(now_ns // SECOND_NS, UTC)
+        stem = f"{self.stem}-{started:{_MOMENT}}" if self.dated else self.stem
         pattern = re.compile(rf"{re.escape(stem)}(?:-([1-9]\d*))?{re.escape(ENDING)}")
         matches = map(pattern.fullmatch, existing)
         last = max((int(match[1] or 1) for match in matches if match), default=0)
@@ -91,13 +90,8 @@ class FileNames:
         moment = _MOMENT_PATTERN if self.dated else ""
         return re.fullmatch(rf"{re.escape(self.stem)}{moment}(-[1-9]\d*)?{re.escape(ENDING)}", name) is not None
 
-    def _stem(self, now: datetime) -> str:
-        return f"{self.stem}-{now.astimezone(UTC):{_MOMENT}}" if self.dated else self.stem
-
 
 Fsync = Literal["never", "chunk", "second"]
-
-SECOND_NS = 1_000_000_000
 
 
 class FlushAndRotation:
@@ -179,7 +173,7 @@ class FlushAndRotation:
         self._now_ns = now_ns
 
 
-DAY_NS = 86_400_000_000_000
+DAY_NS = 24 * 60 * MINUTE_NS
 
 
 class CompleteRecording(NamedTuple):
@@ -248,7 +242,7 @@ def select_deletions(
 
 
 MAX_MARGINS = 10
-"""Largest time from the first alarm to the end of an interval, in margins."""
+"""Largest time from the first alarm to the end of an interval, in margins: alarms may come without an end."""
 RAISED = "raised"
 """Event of an alarm that is raised."""
 
@@ -333,15 +327,9 @@ class BlackBox:
 MAX_CHANNELS = 65_535
 """Channels in a file: https://mcap.dev/spec#channel-op0x04"""
 MAX_OTHER_CHANNELS = 4000
-"""Channels in a file for messages that are not of the product."""
+"""Channels in a file for messages that are not of the product, out of those that `MAX_KEYS` leaves."""
 MAX_KEYS = 60_000
 """Keys of the product in a file, latched messages included; some channels of the format stay free."""
-LATCHED_SHARE = 0.5
-"""Largest share of a file's keys that latched messages take."""
-INACTIVE_NS = 60_000_000_000
-INACTIVE_SHARE = 0.1
-"""Share of keys without a message for `INACTIVE_NS` from which on a full file is followed by the next one."""
-CHECK_INTERVAL_NS = 5_000_000_000
 
 
 _CHANNELS: WeakValueDictionary[tuple[str, str, bool, bool], Channel] = WeakValueDictionary()
@@ -374,11 +362,6 @@ class ChannelBudget:
         self._others: set[Channel] = set()
         self._next_check_ns = 0
 
-    @property
-    def max_latched_messages(self) -> int:
-        """Largest number of latched messages at the start of a file."""
-        return int(LATCHED_SHARE * self._most_keys)
-
     def reset(self, latched: int) -> None:
         """Start a file with a number of latched messages, each of which takes the place of a key."""
         self._latched = latched
@@ -392,9 +375,11 @@ class ChannelBudget:
                 return False
             self._others.add(channel)
             return True
-        if channel not in self._received_ns and self._is_full and channel.key not in self._reserved:
+        received_ns = self._received_ns
+        is_new = channel not in received_ns and channel.key not in self._reserved
+        if is_new and len(received_ns) + self._latched >= self._most_keys:
             return False
-        self._received_ns[channel] = now_ns
+        received_ns[channel] = now_ns
         return True
 
     def has(self, channel: Channel) -> bool:
@@ -402,18 +387,16 @@ class ChannelBudget:
         return channel in self._received_ns or channel in self._others
 
     def needs_new_file(self, channel: Channel, now_ns: int) -> bool:
-        """True if the next file would have a free channel for one that was not admitted to this file."""
-        if not channel.is_product:
-            return False
-        if 0 <= self._next_check_ns - now_ns <= CHECK_INTERVAL_NS:
-            return False
-        self._next_check_ns = now_ns + CHECK_INTERVAL_NS
-        inactive = sum(now_ns - received_ns >= INACTIVE_NS for received_ns in self._received_ns.values())
-        return inactive >= INACTIVE_SHARE * self._most_keys
+        """True if the next file would have room for a channel that was not admitted to this file.
 
-    @property
-    def _is_full(self) -> bool:
-        return len(self._received_ns) + self._latched >= self._most_keys
+        That is so if a tenth of the keys had no message for a minute, which is checked every 5 s at most: it takes a
+        pass over all keys.
+        """
+        if not channel.is_product or 0 <= self._next_check_ns - now_ns <= 5 * SECOND_NS:
+            return False
+        self._next_check_ns = now_ns + 5 * SECOND_NS
+        inactive = sum(now_ns - received_ns >= MINUTE_NS for received_ns in self._received_ns.values())
+        return 10 * inactive >= self._most_keys
 
 
 LATCHED_KINDS: Mapping[str, type[Message]] = {
@@ -433,7 +416,7 @@ class LatchedMessages:
     """Last message of each model, alarm, incident until its alarms are normal, baseline, promise and fault.
 
     Args:
-        capacity: largest number of messages; beyond it the oldest is dropped.
+        capacity: largest number of messages, at most half of the keys of a file; beyond it the oldest is dropped.
     """
 
     def __init__(self, capacity: int = MAX_KEYS // 2) -> None:

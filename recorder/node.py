@@ -7,7 +7,7 @@ from reactorwatch.contract.codec import Encoded, Publication, encode
 from reactorwatch.contract.messages_pb2 import Alarm, CommandReply
 from reactorwatch.errors import InputError
 from reactorwatch.records.record import MINUTE_NS
-from reactorwatch.runtime.node import Node
+from reactorwatch.runtime.bus import Node
 from reactorwatch.runtime.reorder_buffer import Gap
 from recorder.config import MB, RecorderConfig
 from recorder.core import NODE, PRIORITIES, ReceivedMessage, Recorder
@@ -53,8 +53,8 @@ class RecorderNode(Node):
         )
         own = [keys.key(config.plant, keys.ALARM, name) for name in PRIORITIES]
         self._channels = ChannelBudget(config.most_keys, (*own, keys.key(config.plant, keys.HEALTH, NODE)))
-        self._latched = LatchedMessages(self._channels.max_latched_messages)
-        self._black_box = build_black_box(config)
+        self._latched = LatchedMessages(config.most_keys // 2)
+        self._black_box = BlackBox(round(config.black_box_min * MINUTE_NS), own=tuple(PRIORITIES))
         self._next_health_ns = self._next_retry_ns = start_ns
         missed = files.find_missed_intervals(self._black_box, start_ns)
         files.start_file((), start_ns)
@@ -190,8 +190,3 @@ class RecorderNode(Node):
             self._files.abandon()
             return []
         return self._core.resume_recording(now_ns)
-
-
-def build_black_box(config: RecorderConfig) -> BlackBox:
-    """Black box of the settings."""
-    return BlackBox(round(config.black_box_min * MINUTE_NS), own=tuple(PRIORITIES))

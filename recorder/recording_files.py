@@ -1,39 +1,43 @@
 """Files of a recorder: the one being written, complete ones, and those left by a crashed recorder.
 
 The decisions when to flush, rotate, copy and delete are made in `recorder.keep`; this module carries them out.
+
+A wall clock may be wrong at boot and may be set by years; that must not delete a recording. So the age of a recording
+is the time confirmed by the clock since boot: the time in which the machine ran, with or without a recorder. It counts
+from the time at which a recorder completed or found the file. A small file beside the recordings carries it over a
+restart.
 """
 
 import contextlib
 import os
 import shutil
-import threading
+import time
 from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
-from queue import SimpleQueue
 from types import TracebackType
-from typing import Self
+from typing import NamedTuple, Self
 
 import msgspec
 import structlog
 import tomli_w
 
 from reactorwatch.contract import keys
-from reactorwatch.description.find import PlantProcesses
+from reactorwatch.description.read import PlantProcesses
 from reactorwatch.errors import InputError
-from reactorwatch.records.write import make_folder
+from reactorwatch.limits import parse_json
+from reactorwatch.records.write import atomic_write, make_folder
 from reactorwatch.runtime.reorder_buffer import Gap
 from recorder import RecordedMessage, StoredMessage
 from recorder.config import MB, RecorderConfig
 from recorder.core import ReceivedMessage, fingerprint
-from recorder.files.ages import Ages, BootClock, read_boot_clock
 from recorder.files.copies import Window, cut, delete_partial_copies, find_orphans, list_damaged, repair
 from recorder.files.index import span_ns
-from recorder.files.metadata import FILE_INDEX, GAP, PROCESS, gap_metadata, process_metadata
-from recorder.files.part_file import PART, PartFile
 from recorder.files.reader import Reader, Wanted, select_topics
-from recorder.files.writer import RecordingWriter, check_free, part_of
+from recorder.files.recording import FILE_INDEX, GAP, PROCESS, gap_metadata, process_metadata
+from recorder.files.writer import PART, PartFile, RecordingWriter, check_free, part_of
 from recorder.keep import (
     DAY_NS,
     ENDING,
@@ -47,6 +51,86 @@ from recorder.keep import (
 from recorder.samples import content_of
 
 log = structlog.get_logger()
+
+_BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
+
+
+class BootClock(NamedTuple):
+    """Reading of the clock since boot; without an identifier of the boot, those of two processes are not compared."""
+
+    boot: str
+    since_ns: int
+
+
+def read_boot_clock() -> BootClock:
+    """Read the clock since boot."""
+    try:
+        boot = _BOOT_ID.read_text(encoding="ascii").strip()
+    except OSError:
+        return BootClock("", time.monotonic_ns())
+    return BootClock(boot, time.clock_gettime_ns(time.CLOCK_BOOTTIME))
+
+
+class _FirstSeen(msgspec.Struct, frozen=True):
+    modified_ns: int  # a reused name with another modification time is another file
+    seen_ns: int
+
+
+class _StoredAges(msgspec.Struct, frozen=True):
+    boot: str
+    since_ns: int
+    now_ns: int
+    seen: dict[str, _FirstSeen]
+
+
+class Ages:
+    """Confirmed times at which recordings were first seen complete, stored in a file."""
+
+    def __init__(self, path: Path, read_clock: Callable[[], BootClock] = read_boot_clock) -> None:
+        self._path = path
+        self._read_clock = read_clock
+        self._start = read_clock()
+        self._start_ns = 0
+        self._seen: dict[str, _FirstSeen] = {}
+        self._noted: dict[str, _FirstSeen] = {}
+        try:
+            stored = msgspec.convert(parse_json(path.read_bytes()), _StoredAges)
+        except FileNotFoundError:
+            return
+        except (OSError, InputError, msgspec.ValidationError) as error:
+            log.warning("ages of recordings count from now", file=str(path), why=str(error))
+            return
+        same = stored.boot == self._start.boot != "" and stored.since_ns <= self._start.since_ns
+        self._start_ns = stored.now_ns + (self._start.since_ns - stored.since_ns if same else 0)
+        self._seen = stored.seen
+
+    def now_ns(self) -> int:
+        """Confirmed time."""
+        return self._start_ns + self._read_clock().since_ns - self._start.since_ns
+
+    def add(self, name: str, modified_ns: int) -> None:
+        """Add a recording that was completed now; thread-safe."""
+        self._noted[name] = _FirstSeen(modified_ns, self.now_ns())
+
+    def update(self, modified_ns: Iterable[tuple[str, int]]) -> dict[str, int]:
+        """Replace the existing recordings and their modification times; returns when each was first seen, by name."""
+        now_ns = self.now_ns()
+        before, self._seen = self._seen, {}
+        for name, modified in modified_ns:
+            seen = self._noted.pop(name, before.get(name))
+            if seen is None or seen.modified_ns != modified:
+                seen = _FirstSeen(modified, now_ns)
+            self._seen[name] = seen
+        return {name: seen.seen_ns for name, seen in self._seen.items()}
+
+    def store(self) -> None:
+        """Write the file, so that the next recorder resumes from it."""
+        since_ns = self._read_clock().since_ns
+        now_ns = self._start_ns + since_ns - self._start.since_ns
+        stored = _StoredAges(self._start.boot, since_ns, now_ns, self._seen)
+        with atomic_write(self._path) as temporary:
+            temporary.write_bytes(msgspec.json.encode(stored))
+
 
 BLACK_BOX = "black-box"
 """Folder of the copied intervals, beside the recordings."""
@@ -86,15 +170,14 @@ class RecordingFiles:
         self._plants: set[str] = set()  # with samples in the current file
         self._writer: RecordingWriter | None = None
         self._black_boxes = names.folder / BLACK_BOX
-        self._tasks = BackgroundTasks()
+        self._tasks = ThreadPoolExecutor(1, "background tasks")  # slow work on files, in its order
         self._file_count = 0
         self._previous = ""
         self._last_ns = 0
-        first = names.first(datetime.now(UTC))
         self._orphans = [] if not names.folder.is_dir() else find_orphans(names)  # repaired once a file is started
         delete_partial_copies(self._black_boxes, f"{names.stem}-")
         if not self._orphans:
-            check_free(first)
+            check_free(names.next(time.time_ns()))
         self._ages = Ages(names.folder / f".{names.stem}.ages", read_clock)
         self._ages.update((path.name, path.stat().st_mtime_ns) for path in self._deletable())
 
@@ -144,7 +227,7 @@ class RecordingFiles:
             self._writer.write(entry)
         log.info("recording", file=str(path))
         for part in self._orphans:
-            self._tasks.submit(f"recovering {part}", partial(repair, part))
+            self._submit(f"recovering {part}", partial(repair, part))
         self._orphans = []
         return path
 
@@ -258,7 +341,7 @@ class RecordingFiles:
 
     def save_black_box(self, interval: AlarmInterval) -> None:
         """Copy an interval into a file of its own, in the background; flush before."""
-        self._tasks.submit(f"the black box of {interval.alarm}", lambda: self._copy_black_box(interval))
+        self._submit(f"the black box of {interval.alarm}", lambda: self._copy_black_box(interval))
 
     def delete_oldest(self, protected_ns: int | None) -> None:
         """Delete recordings beyond the limits, in the background.
@@ -268,7 +351,7 @@ class RecordingFiles:
         """
         if self._limits != Limits():
             now_ns = self._ages.now_ns()
-            self._tasks.submit("deleting old recordings", lambda: self._delete_oldest(now_ns, protected_ns))
+            self._submit("deleting old recordings", lambda: self._delete_oldest(now_ns, protected_ns))
 
     def __enter__(self) -> Self:
         return self
@@ -279,7 +362,18 @@ class RecordingFiles:
         try:
             self.complete()
         finally:
-            self._tasks.finish()
+            self._tasks.shutdown()
+
+    def _submit(self, name: str, task: Callable[[], None]) -> None:
+        """Queue a task in the background; one that fails is logged by its name and never ends the recording."""
+
+        def work() -> None:
+            try:
+                task()
+            except (InputError, OSError) as error:
+                log.warning(f"{name} failed", why=str(error))
+
+        self._tasks.submit(work).add_done_callback(Future.result)  # it logs an error that is a fault of this software
 
     def _complete_files(self) -> list[Path]:
         if not self._names.folder.is_dir():
@@ -348,32 +442,3 @@ def free_bytes(folder: Path) -> int:
     """Free space on the disk of a folder, which may have been deleted."""
     folder = folder.absolute()
     return shutil.disk_usage(next(path for path in (folder, *folder.parents) if path.is_dir())).free
-
-
-class BackgroundTasks:
-    """Background thread for slow work on files; a failed task is logged and never ends the recording."""
-
-    def __init__(self) -> None:
-        self._queue: SimpleQueue[tuple[str, Callable[[], None]] | None] = SimpleQueue()
-        self._thread: threading.Thread | None = None
-
-    def submit(self, name: str, task: Callable[[], None]) -> None:
-        """Queue a task; `name` describes it in the log."""
-        if self._thread is None:
-            self._thread = threading.Thread(target=self._work, name="background tasks", daemon=True)
-            self._thread.start()
-        self._queue.put((name, task))
-
-    def finish(self) -> None:
-        """Wait until all tasks are done; none may be submitted afterwards."""
-        if self._thread is not None:
-            self._queue.put(None)
-            self._thread.join()
-
-    def _work(self) -> None:
-        while (item := self._queue.get()) is not None:
-            name, task = item
-            try:
-                task()
-            except (InputError, OSError) as error:
-                log.warning(f"{name} failed", why=str(error))

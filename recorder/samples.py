@@ -23,13 +23,6 @@ from reactorwatch.records.record import LARGEST_VALUE
 from reactorwatch.runtime.gap_tracker import GapTracker
 from recorder import RecordedMessage
 
-MAX_GAPS = 256  # stored gaps of a signal; a late sample of an older gap is counted as a duplicate
-MAX_POINTS = 256
-"""Stored (number, time) points; beyond it every second one of the older half is dropped."""
-
-MIN_SPACING, MAX_SPACING = 0.75, 4.0
-"""Range of the spacing after a stray, in usual spacings, in which a sample continues the run before it."""
-
 
 def content_of(message: RecordedMessage | Encoded) -> Message | None:
     """Decoded content of a message; None if its payload is not what its encoding names."""
@@ -108,7 +101,7 @@ class SequenceCounter(GapTracker):
         points: increasing (number, time) of samples of the run.
     """
 
-    max_gaps = MAX_GAPS
+    max_gaps = 256  # stored gaps; a late sample of an older gap is counted as a duplicate
 
     lost: int = 0
     duplicated: int = 0
@@ -125,8 +118,8 @@ class SequenceCounter(GapTracker):
         if sequence == expected and time_ns > self.newest_ns and count > 1:  # as nearly always, so written out
             self.expected, self.newest_ns, self._checkpoint = sequence + 1, time_ns, None
             points.append((sequence, time_ns))
-            if count >= MAX_POINTS:
-                del points[1 : MAX_POINTS // 2 : 2]
+            if count >= self.max_gaps:
+                self._thin_out()
             return SAME_RUN
         if expected is None:
             self.advance(sequence, time_ns)
@@ -143,9 +136,13 @@ class SequenceCounter(GapTracker):
     def advance(self, number: int, time_ns: int = 0) -> int:
         """Add the newest sample; returns how many were skipped."""
         self.points.append((number, time_ns))
-        if len(self.points) > MAX_POINTS:
-            del self.points[1 : MAX_POINTS // 2 : 2]
+        if len(self.points) > self.max_gaps:
+            self._thin_out()
         return GapTracker.advance(self, number, time_ns)
+
+    def _thin_out(self) -> None:
+        """Drop every second point of the older half, so that their number is bounded."""
+        del self.points[1 : self.max_gaps // 2 : 2]
 
     def _checkpoint_at(self, expected: int, newest_ns: int) -> _Checkpoint:
         return _Checkpoint(expected, newest_ns, self.lost, len(self.gaps), self.lowest, self.gaps, self.points)
@@ -186,7 +183,10 @@ class SequenceCounter(GapTracker):
         return transition
 
     def _follows_checkpoint(self, sequence: int, time_ns: int) -> bool:
-        """True if a sample continues the run as if the newest sample had not been received."""
+        """True if a sample continues the run as if the newest sample had not been received.
+
+        Its spacing is then 0.75 to 4 times the usual one: less would be the stray's own run, more a run after a stop.
+        """
         before = self._checkpoint
         if before is None or sequence < before.expected or time_ns <= before.newest_ns:
             return False
@@ -196,7 +196,7 @@ class SequenceCounter(GapTracker):
         (number, then_ns), (last, last_ns) = points[-2:]
         usual_ns = (last_ns - then_ns) / (last - number)
         spacing_ns = (time_ns - before.newest_ns) / (sequence - before.expected + 1)
-        return MIN_SPACING * usual_ns <= spacing_ns <= MAX_SPACING * usual_ns
+        return 0.75 * usual_ns <= spacing_ns <= 4.0 * usual_ns
 
     def _roll_back(self, stray: int) -> None:
         """Restore the state before the newest sample, a stray; one with the expected number is not lost."""

@@ -2,7 +2,7 @@
 
 import socket
 
-from reactorwatch.runtime.loopback import LOOPBACK, free_port, reserve_port
+from reactorwatch.runtime.http_pages import LOOPBACK, free_port, reserve_port
 
 
 def three_free_ports() -> int:

@@ -3,8 +3,7 @@
 from collections.abc import Mapping
 from pathlib import Path
 
-from reactorwatch.description.find import find_process
-from reactorwatch.description.read import read_process_table
+from reactorwatch.description.read import find_process, read_process_table
 from reactorwatch.records.record import Record
 
 REACTOR = find_process().without_equations()

@@ -1,7 +1,7 @@
 """The fault bank that the monitor is measured on: faults, sizes and onsets, their records, and runs without a fault.
 
 Every cause that the monitor compares (see `isolation.isolation.causes`) sets in as a step, and three of them as a ramp
-too, each in three sizes: small is about the smallest that the oracle (`benchmarks/faults/oracle.py`) finds within an
+too, each in three sizes: small is about the smallest that the oracle (`benchmarks/faults/study.py`) finds within an
 hour, medium eight times as much, and large ten times that: as gross as the report's method needs. Large faults that
 cool the reactor put it out: that is noted, not avoided.
 

@@ -22,7 +22,7 @@ from reactorwatch.contract.codec import Encoded, Publication, decode, encode
 from reactorwatch.runtime.bus_zenoh import ZenohBus, connect
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.event_loop import StopSignal
-from reactorwatch.runtime.loopback import free_port
+from reactorwatch.runtime.http_pages import free_port
 from recorder.config import RecorderConfig
 
 Manner = Literal["closed", "stalled"]

@@ -6,8 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from benchmarks.harness.tables import stamp
-from benchmarks.outside import free_run, tennessee, three_tanks, water_circuit
+from benchmarks.harness.study import stamp
+from benchmarks.outside import reactors_and_tanks, tennessee, water_circuit
 from benchmarks.outside.scores import Row, markdown
 
 SEED = 1
@@ -30,9 +30,9 @@ BENCHMARKS = (
     Benchmark("Tennessee Eastman: detection", "tep", tennessee.measure, tennessee.RECORDS),
     Benchmark("Tennessee Eastman: place of a fault", "tep", tennessee.measure_places, ONE_OF_EACH),
     Benchmark("SKAB: anomalies and change points", "skab", water_circuit.measure, water_circuit.RECORDS),
-    Benchmark("Three tanks: cause and place", "three_tanks", three_tanks.measure, ONE_OF_EACH),
-    Benchmark("Cascaded tanks: simulation", "cascaded_tanks", free_run.measure_tanks, ONE),
-    Benchmark("DaISy reactor: simulation", "daisy_cstr.csv", free_run.measure_reactor, ONE),
+    Benchmark("Three tanks: cause and place", "three_tanks", reactors_and_tanks.measure_faults, ONE_OF_EACH),
+    Benchmark("Cascaded tanks: simulation", "cascaded_tanks", reactors_and_tanks.measure_tanks, ONE),
+    Benchmark("DaISy reactor: simulation", "daisy_cstr.csv", reactors_and_tanks.measure_reactor, ONE),
 )
 
 

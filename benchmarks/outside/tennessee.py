@@ -13,9 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.outside.command import WatchedRows, backtest
 from benchmarks.outside.peers import PEERS, Array, cross_validated_limits, smooth
-from benchmarks.outside.scores import Flags, Row, blocks_of, bootstrap_interval
+from benchmarks.outside.scores import Flags, Row, WatchedRows, backtest, blocks_of, bootstrap_interval
 
 ONSET = 160
 SIGNALS, MEASURED = 52, 41

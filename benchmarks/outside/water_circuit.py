@@ -13,9 +13,16 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.outside.command import WatchedRows, backtest
 from benchmarks.outside.peers import Array, Pca
-from benchmarks.outside.scores import Flags, Row, bootstrap_interval, compare_rows, score_change_points
+from benchmarks.outside.scores import (
+    Flags,
+    Row,
+    WatchedRows,
+    backtest,
+    bootstrap_interval,
+    compare_rows,
+    score_change_points,
+)
 
 TRAINING = 400
 WINDOW_S = 60.0

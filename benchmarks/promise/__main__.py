@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Sequence
 
 from benchmarks.harness.plants import FLOWS, KINDS, NOISE_SD
-from benchmarks.harness.pool import Pool, add_options
+from benchmarks.harness.study import Pool, add_options
 from benchmarks.promise import black_box, statements
 from benchmarks.promise.not_quite import print_plants
 

@@ -17,8 +17,7 @@ from msgspec.structs import replace
 from benchmarks.faults.detectors import intervals_of, outcome_of
 from benchmarks.harness.bank import AFTER_MIN, Case, cases, record_of
 from benchmarks.harness.plants import FLOWS, NOISE_SD, messages_of, sound_record, without_equations
-from benchmarks.harness.pool import Pool
-from benchmarks.harness.tables import head, line, median_interval, percent, poisson_interval
+from benchmarks.harness.study import Pool, head, line, median_interval, percent, poisson_interval
 from monitor_node.config import MonitorConfig, ReferenceName
 from monitor_node.core import Monitor
 from monitor_node.learn.black_box_reference import BlackBoxMemory

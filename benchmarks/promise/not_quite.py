@@ -7,8 +7,7 @@ import numpy as np
 
 import reactorwatch as rw
 from benchmarks.harness.plants import INPUTS, KINDS, simulate
-from benchmarks.harness.pool import Pool
-from benchmarks.harness.tables import head, line, median_interval, poisson_interval, share_interval
+from benchmarks.harness.study import Pool, head, line, median_interval, poisson_interval, share_interval
 
 SEED, SEED_STEP = 100, 1000
 """Seed of the first plant of the first set, and the difference to that of the next set."""

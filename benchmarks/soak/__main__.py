@@ -17,9 +17,8 @@ from pathlib import Path
 
 from benchmarks.soak.findings import Findings, assess, count_unaccounted
 from benchmarks.soak.plan import KNOWN_ROWS, Plan, draw_plan
-from benchmarks.soak.site import MONITORS, Site
-from benchmarks.soak.witness import Witness
-from reactorwatch.runtime import logs
+from benchmarks.soak.site import MONITORS, Site, Witness
+from reactorwatch.runtime.node_main import configure_log
 
 MINUTES, PLANTS = 10.0, 200
 ROWS_PER_S = 2.0
@@ -90,7 +89,7 @@ def table(plan: Plan, findings: Findings) -> str:
 
 def main() -> int:
     """Run a soak and print its findings; returns 1 if it failed."""
-    logs.configure()
+    configure_log()
     minutes = float(sys.argv[1]) if len(sys.argv) > 1 else MINUTES
     plants = int(sys.argv[2]) if len(sys.argv) > 2 else PLANTS
     seed = int(sys.argv[3]) if len(sys.argv) > 3 else time.time_ns() % 1_000_000

@@ -18,8 +18,8 @@ from benchmarks.harness.site import connect_client
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication, encode, encoding_of
 from reactorwatch.contract.messages_pb2 import Alarm, Quality, Sample
-from reactorwatch.runtime import logs
 from reactorwatch.runtime.config import BusConfig
+from reactorwatch.runtime.node_main import configure_log
 
 PAUSE_S = 0.05
 AT_A_TIME = 10
@@ -126,5 +126,5 @@ def main(task: Task) -> None:
 
 
 if __name__ == "__main__":
-    logs.configure()
+    configure_log()
     main(msgspec.json.decode(sys.argv[1], type=Task))

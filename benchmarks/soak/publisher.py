@@ -17,8 +17,8 @@ from plant_node.node import PlantNode
 from plant_node.record import plant_from
 from reactorwatch.contract.codec import encode
 from reactorwatch.records.record import MINUTE_NS
-from reactorwatch.runtime import logs
 from reactorwatch.runtime.config import BusConfig
+from reactorwatch.runtime.node_main import configure_log
 
 SHARING = 25
 """Plants that share a session: it takes the longer for a message the more keys it has."""
@@ -90,5 +90,5 @@ def _nothing(_: str) -> None:
 
 
 if __name__ == "__main__":
-    logs.configure()
+    configure_log()
     publish(msgspec.json.decode(sys.argv[1], type=Task))

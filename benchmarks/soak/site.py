@@ -1,4 +1,4 @@
-"""The processes of a soak, and the disturbances of them.
+"""The processes of a soak, their disturbances, and an observer on a link that is never cut.
 
 A router, two monitors with a shard of the fleet each, two processes of plants, a source of garbage.
 The links of both monitors and of the second half of the plants go through proxies.
@@ -13,15 +13,18 @@ from typing import Any
 
 import msgspec
 
-from benchmarks.harness.site import Proxy, Router
+from benchmarks.harness.site import Proxy, Router, connect_client
 from benchmarks.soak import garbage, publisher
 from benchmarks.soak.findings import Taken, own_memory_mb
 from benchmarks.soak.plan import Blow, Plan
-from monitor_node.fleet.config import FleetConfig
+from monitor_node.fleet import FleetConfig
+from monitor_node.health import NODE
 from reactorwatch.cli.processes import write_settings
 from reactorwatch.contract import keys
+from reactorwatch.contract.codec import DecodeError, Encoded, decode
+from reactorwatch.contract.messages_pb2 import Alarm, Health
 from reactorwatch.runtime.config import BusConfig
-from reactorwatch.runtime.loopback import free_endpoint
+from reactorwatch.runtime.http_pages import free_endpoint
 
 ROOT = Path(__file__).parents[2]
 MONITORS = PARTS = 2
@@ -214,3 +217,52 @@ def _tell(process: "subprocess.Popen[str]", line: str) -> None:
     assert process.stdin is not None
     process.stdin.write(f"{line}\n")
     process.stdin.flush()
+
+
+class Witness:
+    """Collects alarms, health and tokens of the monitors."""
+
+    def __init__(self, config: BusConfig) -> None:
+        self._changed = threading.Condition()
+        self._tokens: set[str] = set()
+        self.alarms: dict[str, list[Alarm]] = {}
+        self.health: dict[str, Health] = {}
+        self.longest_lag_ms = 0.0
+        self._bus = connect_client(config)
+        self._bus.subscribe_liveliness(f"{keys.ROOT}/{keys.FLEET}/**", self._on_token)
+        self._bus.subscribe(f"{FLEET}/{keys.ALARM}/**", self._on_message)
+        self._bus.subscribe(f"{FLEET}/{keys.HEALTH}/{NODE}", self._on_message)
+
+    def wait_for_monitors(self, count: int) -> None:
+        """Wait for a number of live monitors."""
+        assert self.wait(lambda: len(self._tokens) == count), f"not {count} monitors, but {self._tokens}"
+
+    def wait(self, condition: Callable[[], bool], within_s: float = PATIENCE_S) -> bool:
+        """Wait for a condition on the messages; returns True if it holds."""
+        with self._changed:
+            return self._changed.wait_for(condition, within_s)
+
+    def close(self) -> None:
+        """Close the link."""
+        self._bus.close()
+
+    def _on_token(self, key: str, is_alive: bool) -> None:
+        with self._changed:
+            (self._tokens.add if is_alive else self._tokens.discard)(key)
+            self._changed.notify_all()
+
+    def _on_message(self, message: Encoded) -> None:
+        topic = keys.parse(message.key)
+        try:
+            body = decode(message.payload, message.encoding)
+        except DecodeError:
+            return  # garbage
+        if topic is None:
+            return
+        with self._changed:
+            if isinstance(body, Health):
+                self.health[topic.plant] = body
+                self.longest_lag_ms = max(self.longest_lag_ms, body.lag_ms)
+            elif isinstance(body, Alarm) and body.alarm == topic.name:
+                self.alarms.setdefault(topic.plant, []).append(body)
+            self._changed.notify_all()

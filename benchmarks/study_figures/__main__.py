@@ -5,23 +5,14 @@ import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
-from benchmarks.harness.pool import Pool
+from benchmarks.harness.study import Pool
 
 if TYPE_CHECKING:
-    from benchmarks.study_figures.figure import Figure, Finding
+    from benchmarks.study_figures.study import Figure
 
 PAGE = "study.md"
-
-
-class Job(NamedTuple):
-    """A figure to be drawn."""
-
-    key: str  # key of the figure
-    picture: Path  # file of the picture
-    seed: int  # seed of every simulated record
-    data: Path | None = None  # folder of records of others
 
 
 def main(words: Sequence[str] | None = None) -> int:
@@ -43,7 +34,7 @@ def reproduce(
     out: Path, seed: int, only: str | None = None, *, data: Path | None = None, processes: int | None = 1
 ) -> str:
     """Write `out`/study.md and its pictures; returns what was written, for people."""
-    from benchmarks.study_figures.catalogue import FOLDER, page
+    from benchmarks.study_figures.catalogue import FOLDER, Job, draw, page
     from reactorwatch.records.write import atomic_write, fill_folder, make_folder
 
     figures = _select_figures(only, data)
@@ -57,27 +48,11 @@ def reproduce(
     return "\n".join([f"wrote {out / PAGE} and {len(found)} pictures; the report's claims are:", *lines])
 
 
-def draw(job: Job) -> "Finding":
-    """Draw a figure."""
-    from benchmarks.study_figures.figure import paper
-    from benchmarks.study_figures.study import Study
-
-    (figure,) = (item for item in _entries(job.data) if item.key == job.key)
-    with paper(job.picture, figure.height_px) as drawing:
-        return figure.draw(Study(job.seed), drawing)
-
-
-def _entries(data: Path | None) -> "Sequence[Figure]":
-    from benchmarks.study_figures.catalogue import FIGURES
-    from benchmarks.study_figures.measured_records import measured_figure
-
-    return FIGURES if data is None else (*FIGURES, measured_figure(data))
-
-
 def _select_figures(only: str | None, data: Path | None) -> "Sequence[Figure]":
+    from benchmarks.study_figures.catalogue import entries
     from reactorwatch.errors import InputError, describe_unknown
 
-    keys = {figure.key: figure for figure in _entries(data)}
+    keys = {figure.key: figure for figure in entries(data)}
     wanted = list(keys) if only is None else [part.strip() for part in only.split(",")]
     for part in wanted:
         if part not in keys:

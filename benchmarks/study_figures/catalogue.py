@@ -7,9 +7,12 @@ figures 1 and 2 show no result: a block diagram and a drawing of the reactor.
 
 from collections.abc import Sequence
 from functools import partial
+from pathlib import Path
+from typing import NamedTuple
 
-from benchmarks.study_figures import controllers, fault_records, flow_chart, models, plant, sampling
-from benchmarks.study_figures.figure import Figure, Finding
+from benchmarks.study_figures import fault_records, flow_chart, models, plant, sampling
+from benchmarks.study_figures.measured_records import measured_figure
+from benchmarks.study_figures.study import Figure, Finding, Study, paper
 
 _ORDERS = {1: "first", 2: "second", 3: "third"}
 _RECORDS = {
@@ -103,18 +106,6 @@ FIGURES: tuple[Figure, ...] = (
         plant.phase_plane,
     ),
     Figure(
-        "section-temperature-control",
-        "Proportional temperature controller",
-        "A proportional controller of the temperature moves the coolant flow.",
-        controllers.temperature,
-    ),
-    Figure(
-        "section-level-control",
-        "Level controller",
-        "A level controller moves the outlet flow; the equations take the volume as constant.",
-        controllers.level,
-    ),
-    Figure(
         "section-excitation",
         "Excitation",
         "A single sinusoid must be avoided; sums of sinusoids and square waves are good.",
@@ -193,3 +184,24 @@ def _anchor(figure: Figure) -> str:
     """Anchor that GitHub makes of the heading."""
     kept = "".join(letter for letter in figure.heading.lower() if letter.isalnum() or letter in " -")
     return kept.replace(" ", "-")
+
+
+class Job(NamedTuple):
+    """A figure to be drawn."""
+
+    key: str  # key of the figure
+    picture: Path  # file of the picture
+    seed: int  # seed of every simulated record
+    data: Path | None = None  # folder of records of others
+
+
+def entries(data: Path | None) -> Sequence[Figure]:
+    """All figures, with the entry of a folder of records of others if there is one."""
+    return FIGURES if data is None else (*FIGURES, measured_figure(data))
+
+
+def draw(job: Job) -> Finding:
+    """Draw a figure; not in `__main__`, whose functions a worker process does not find."""
+    (figure,) = (item for item in entries(job.data) if item.key == job.key)
+    with paper(job.picture, figure.height_px) as drawing:
+        return figure.draw(Study(job.seed), drawing)

@@ -9,21 +9,24 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Drawing
 
 from benchmarks.harness.plants import messages_of
-from benchmarks.study_figures.figure import (
+from benchmarks.study_figures.report_scheme import WIDTH, ReportChart, chart_output
+from benchmarks.study_figures.study import (
     BLACK,
     BLUE,
     GREEN,
     GREY,
+    NAMES,
     ORANGE,
+    OUTPUTS,
+    TRAINING_ROWS,
     VERMILION,
     Finding,
+    Study,
     Verdict,
     label,
     legend_below,
     panels,
 )
-from benchmarks.study_figures.report_scheme import WIDTH, ReportChart, chart_output
-from benchmarks.study_figures.study import NAMES, OUTPUTS, TRAINING_ROWS, Study
 from monitor_node.config import MonitorConfig
 from monitor_node.replay import backtest
 from plant_node.config import PlantConfig

@@ -26,9 +26,24 @@ from matplotlib.figure import Figure as Drawing
 from numpy.typing import ArrayLike
 from scipy.stats import binom
 
-from benchmarks.study_figures.figure import BLACK, GREEN, GREY, ORANGE, PURPLE, SKY, VERMILION, Finding, Verdict, panels
 from benchmarks.study_figures.report_scheme import ORDER
-from benchmarks.study_figures.study import FAST_PERIOD_MIN, TRAINING_ROWS, Study, levels, row_times
+from benchmarks.study_figures.study import (
+    BLACK,
+    FAST_PERIOD_MIN,
+    GREEN,
+    GREY,
+    ORANGE,
+    PURPLE,
+    SKY,
+    TRAINING_ROWS,
+    VERMILION,
+    Finding,
+    Study,
+    Verdict,
+    levels,
+    panels,
+    row_times,
+)
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from plant_node.scenario import RandomSteps

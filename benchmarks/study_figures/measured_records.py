@@ -16,36 +16,27 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Drawing
 
 import reactorwatch as rw
-from benchmarks.study_figures.figure import (
+from benchmarks.outside.reactors_and_tanks import describe_rig
+from benchmarks.study_figures.report_scheme import chart_output
+from benchmarks.study_figures.study import (
     BLACK,
     BLUE,
     ORANGE,
     VERMILION,
     Figure,
     Finding,
+    Study,
     Verdict,
     label,
     legend_below,
     panels,
 )
-from benchmarks.study_figures.report_scheme import chart_output
-from benchmarks.study_figures.study import Study
 from reactorwatch.arrays import Array
-from reactorwatch.description.find import find_process
+from reactorwatch.description.read import find_process
 
 ONSET, BIAS = 0.6, 0.1
 TITLE = "Measured records with added faults"
 
-_TANKS = 'name = "rig"\nequations = "three_tanks"\n[time]\ncolumn = "sample"\nunit = "s"\n' + "".join(
-    f'[[signals]]\nname = "{name}"\ncolumn = "{column}"\nrole = "{role}"\nunit = "{unit}"\n'
-    for name, column, role, unit in (
-        ("Q1", "Q1_cm3_s", "input", "cm3/s"),
-        ("Q2", "Q2_cm3_s", "input", "cm3/s"),
-        ("h1", "h1_cm", "output", "cm"),
-        ("h2", "h2_cm", "output", "cm"),
-        ("h3", "h3_cm", "output", "cm"),
-    )
-)
 _LAB = 'name = "lab"\n[time]\ncolumn = "Time (sec)"\nunit = "s"\n' + "".join(
     f'[[signals]]\nname = "{name}"\ncolumn = "{column}"\nrole = "{role}"\n'
     for name, column, role in (
@@ -69,7 +60,7 @@ class Source:
 
 SOURCES = (
     Source("DaISy reactor", "daisy_cstr.csv", "", 1000),
-    Source("three tanks, normal", "three_tanks/normal.csv", _TANKS, 1000),
+    Source("three tanks, normal", "three_tanks/normal.csv", describe_rig(), 1000),
     Source("TCLab", "tclab/tclab.csv", _LAB, 200),
 )
 FAULTS: dict[str, Callable[[Array], Array]] = {

@@ -6,22 +6,26 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Drawing
 
-from benchmarks.study_figures.figure import (
+from benchmarks.study_figures.neural import Neural
+from benchmarks.study_figures.report_scheme import EVERY, ORDER, SKIP
+from benchmarks.study_figures.study import (
     BLACK,
     BLUE,
+    NAMES,
     ORANGE,
+    ORDERS,
+    OUTPUTS,
     PURPLE,
     VERMILION,
     Finding,
+    Study,
     Verdict,
+    holdout_half,
     label,
     legend_below,
     panels,
     verdict,
 )
-from benchmarks.study_figures.neural import Neural
-from benchmarks.study_figures.report_scheme import EVERY, ORDER, SKIP
-from benchmarks.study_figures.study import NAMES, ORDERS, OUTPUTS, Study, holdout_half
 from reactorwatch.identification.least_squares import SINGULAR_CONDITION
 from reactorwatch.identification.linear_model import LinearModel, fit_percent
 from reactorwatch.identification.selection import EQUAL_PERCENT, LINEAR_FITS, Candidate, Fit, Selection, select

@@ -4,24 +4,27 @@ import numpy as np
 from matplotlib.figure import Figure as Drawing
 from scipy.optimize import brentq
 
-from benchmarks.study_figures.figure import (
+from benchmarks.study_figures.study import (
     BLACK,
     BLUE,
     GREEN,
+    NAMES,
     ORANGE,
     PURPLE,
     SKY,
     VERMILION,
     Finding,
+    Study,
     Verdict,
+    edge,
     label,
     legend_below,
     panels,
+    row_times,
     verdict,
 )
-from benchmarks.study_figures.study import NAMES, Study, edge, row_times
 from reactorwatch.process.library.cstr import OPERATING_COOLANT_FLOW
-from reactorwatch.process.linearise import StepComparison, compare_step
+from reactorwatch.process.steady_state import StepComparison, compare_step
 
 _STEP_FLOWS = {85.0: BLUE, 90.0: GREEN, 95.0: PURPLE, 100.0: ORANGE, 105.0: VERMILION, 110.0: BLACK}
 _STEP = 1.0  # l/min
@@ -227,7 +230,7 @@ def _compare(study: Study, step: float) -> StepComparison:
 
 def _steady_change(study: Study, step: float) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
     """Change of the linear model's outputs at rest after a step, shape (n_y,)."""
-    from reactorwatch.process.linearise import linearise
+    from reactorwatch.process.steady_state import linearise
 
     linear = linearise(study.model, study.operating(FLOW).state, np.array([FLOW]))
     return np.asarray((linear.D - linear.C @ np.linalg.solve(linear.A, linear.B)) @ np.array([step]))

@@ -6,22 +6,27 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure as Drawing
 
-from benchmarks.study_figures.figure import (
+from benchmarks.study_figures.report_scheme import EVERY, SKIP, report_rows
+from benchmarks.study_figures.study import (
     BLACK,
     BLUE,
+    FAST_PERIOD_MIN,
     GREEN,
     GREY,
+    IDENTIFICATION_HOLD_MIN,
     ORANGE,
+    ORDERS,
     PURPLE,
     VERMILION,
     Finding,
+    Study,
     Verdict,
     label,
+    levels,
     panels,
+    row_times,
     verdict,
 )
-from benchmarks.study_figures.report_scheme import EVERY, SKIP, report_rows
-from benchmarks.study_figures.study import FAST_PERIOD_MIN, IDENTIFICATION_HOLD_MIN, ORDERS, Study, levels, row_times
 from plant_node.scenario import RandomSteps, Scenario, Sines, Square
 from reactorwatch.arrays import Array
 from reactorwatch.errors import InputError

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from reactorwatch.errors import InputError
 from reactorwatch.records.write import atomic_write, make_folder
-from reactorwatch.runtime.loopback import free_port
+from reactorwatch.runtime.http_pages import free_port
 from recorder.view.viewer import describe_exit, viewer
 
 if TYPE_CHECKING:

@@ -1,24 +1,30 @@
-"""One alarm: its chart, the rule that raises and clears it, and its memory.
+"""Alarms: the rule that raises and clears one, its memory, incidents of several, and the operator's load (KPIs).
 
-The rule is an on-delay and an off-delay (ISA-18.2), m out of n.
+The rule is an on-delay and an off-delay (ISA-18.2), m out of n. One point beyond 3 sigma comes by chance every 370
+samples: at ten samples a minute, every 37 minutes. No operator could work with that. So an alarm is raised by
+`raise_count` violating points among the last `window` (on-delay), and cleared by `clear_count` ordinary points in a row
+(off-delay). With a dead band a point near the limit is neither violating nor ordinary, so that a value near its limit
+gives one alarm and not many. The remaining rate of false alarms is `spc.run_length.false_alarm_rates`.
 
-One point beyond 3 sigma comes by chance every 370 samples: at ten samples a minute, every 37 minutes. No operator could
-work with that. So an alarm is raised by `raise_count` violating points among the last `window` (on-delay), and cleared
-by `clear_count` ordinary points in a row (off-delay). With a dead band a point near the limit is neither violating nor
-ordinary, so that a value near its limit gives one alarm and not many. The remaining rate of false alarms is
-`spc.run_length.false_alarm_rates`.
+The KPIs are those of EEMUA 191 (2013) and ANSI/ISA-18.2 (2016). An operator can deal with about one alarm in ten
+minutes. More than ten in ten minutes are a *flood*, in which alarms are no longer read. An alarm activated three times
+within a minute *chatters*: its delays or its dead band are too small. One that has been active for more than a day is
+*stale*: it calls for no action, so it should not be an alarm. An alarm is counted when it becomes unacknowledged. All
+times are plant time.
 """
 
-from collections.abc import Mapping, Sequence
-from typing import Annotated, TypeAlias
+from collections.abc import Collection, Mapping, Sequence
+from typing import Annotated, NamedTuple, TypeAlias
 
 import msgspec
 import numpy as np
 
 from reactorwatch.codegen.numba_kernel import Entry, jit
 from reactorwatch.contract import keys
-from reactorwatch.contract.alarm_states import State
-from reactorwatch.contract.messages_pb2 import Priority, Suspect
+from reactorwatch.contract.alarm_states import CODES, State
+from reactorwatch.contract.messages_pb2 import AlarmKpis, Priority, PriorityCount, Suspect
+from reactorwatch.contract.messages_pb2 import Incident as IncidentMessage
+from reactorwatch.records.record import MINUTE_NS
 from reactorwatch.spc.charts.base import Judgement
 from reactorwatch.spc.run_length import check_rule
 from reactorwatch.stored_state import Memory
@@ -94,16 +100,7 @@ def raises(recent: int, raise_count: int, violating: bool) -> bool:
 
 @jit
 def is_ordinary(statistic: float, centre: float, lower: float, upper: float, above: bool, reach: float) -> bool:
-    """True if a point is within the limit that was crossed, by the dead band.
-
-    Args:
-        statistic: statistic of the point.
-        centre: centre of the chart.
-        lower: lower limit.
-        upper: upper limit.
-        above: True if the upper limit was crossed.
-        reach: share of the way from the centre to the limit that is ordinary.
-    """
+    """True if a point is within the limit that was crossed, by the dead band."""
     deviation = statistic - centre
     return deviation <= reach * (upper - centre) if above else deviation >= reach * (lower - centre)
 
@@ -229,11 +226,6 @@ class ChartAlarm:
         self._mask, self._reach = (1 << window) - 1, 1 - dead_band
         self.memory = AlarmMemory()
 
-    @property
-    def is_idle(self) -> bool:
-        """True if a point within the limits would change nothing."""
-        return not (self.memory.standing or self.memory.recent)
-
     def update(self, judgement: Judgement, unit: str = "", time_ns: int | None = None) -> AlarmChange | None:
         """Update the alarm's condition with a point of the chart.
 
@@ -259,3 +251,104 @@ class ChartAlarm:
         else:
             return None
         return AlarmChange(self, judgement, memory.standing, unit, time_ns)
+
+
+URGENCY = (
+    *(State.UNACKNOWLEDGED, State.ACKNOWLEDGED, State.RETURNED_UNACKNOWLEDGED, State.SHELVED),
+    *(State.SUPPRESSED_BY_DESIGN, State.OUT_OF_SERVICE, State.NORMAL),
+)
+"""States of alarms, the most urgent first; an incident has that of its most urgent alarm."""
+
+CHATTER_WITHIN_NS = MINUTE_NS
+
+
+class Incident(msgspec.Struct, forbid_unknown_fields=True):
+    """Memory of an incident.
+
+    Attributes:
+        number: number of the incident from 1.
+        since_ns: activation of its first alarm.
+        changed_ns: time when an alarm of the incident was last raised or cleared.
+        alarms: names of its alarms in the order of their activation; the first is the first-out alarm.
+        suspects: its possible causes, the likeliest first; empty before a search.
+        text: what limits the suspects; empty: nothing.
+        published: its newest message without the time, serialized.
+    """
+
+    number: Count
+    since_ns: TimeNs = 0
+    changed_ns: TimeNs = 0
+    alarms: list[str] = msgspec.field(default_factory=list)
+    suspects: list[SuspectedCause] = msgspec.field(default_factory=list)
+    text: str = ""
+    published: bytes = b""
+
+    def message(self, members: Collection[AlarmMemory]) -> IncidentMessage:
+        """The incident as a message, without the time."""
+        return IncidentMessage(
+            number=self.number,
+            since_ns=self.since_ns,
+            until_ns=0 if any(alarm.is_active for alarm in members) else self.changed_ns,
+            state=CODES[min((alarm.state for alarm in members), key=URGENCY.index, default=State.NORMAL)],
+            alarms=self.alarms,
+            suspects=[item.message for item in self.suspects],
+            text=self.text,
+        )
+
+
+def is_empty(kpis: AlarmKpis) -> bool:
+    """True if no alarm was ever activated, and none is shelved, suppressed or out of service."""
+    given = {field.name for field, _ in kpis.ListFields()} - {"time_ns", "priorities"}
+    return not (given or any(count.raised for count in kpis.priorities))
+
+
+class Activation(NamedTuple):
+    """Activation of an alarm."""
+
+    time_ns: int
+    alarm: str
+
+
+class KpiCounter(Memory):
+    """Counter of activations.
+
+    Attributes:
+        recent: activations within the last ten minutes, the oldest first.
+        raised: number of activations so far, by priority code.
+    """
+
+    recent: list[Activation] = msgspec.field(default_factory=list)
+    raised: dict[int, Count] = msgspec.field(default_factory=dict)
+
+    def compute(self, time_ns: int, alarms: Collection[ChartAlarm], incidents: int) -> AlarmKpis:
+        """Compute the KPIs."""
+        # Those in the future are from before the clock was set back.
+        recent = self.recent = [item for item in self.recent if 0 <= time_ns - item.time_ns < 10 * MINUTE_NS]
+        abnormal = [alarm for alarm in alarms if alarm.memory.state is not State.NORMAL]  # few of hundreds
+        states = [alarm.memory.state for alarm in abnormal]
+        active = [alarm for alarm in abnormal if alarm.memory.state in (State.UNACKNOWLEDGED, State.ACKNOWLEDGED)]
+        return AlarmKpis(
+            time_ns=time_ns,
+            alarms_10min=len(recent),
+            flood=len(recent) > 10,
+            chattering=sorted({item.alarm for item in recent if self._chatters(item.alarm)}),
+            standing=[alarm.name for alarm in active],
+            stale=[alarm.name for alarm in active if time_ns - alarm.memory.raised_ns > 24 * 60 * MINUTE_NS],
+            priorities=[
+                PriorityCount(
+                    priority=priority,
+                    raised=self.raised.get(priority, 0),
+                    standing=sum(alarm.priority == priority for alarm in active),
+                )
+                for priority in sorted(PRIORITIES.values(), reverse=True)
+            ],
+            unacknowledged=states.count(State.UNACKNOWLEDGED) + states.count(State.RETURNED_UNACKNOWLEDGED),
+            shelved=states.count(State.SHELVED),
+            suppressed=states.count(State.SUPPRESSED_BY_DESIGN),
+            out_of_service=states.count(State.OUT_OF_SERVICE),
+            incidents=incidents,
+        )
+
+    def _chatters(self, alarm: str) -> bool:
+        times = [item.time_ns for item in self.recent if item.alarm == alarm]
+        return any(last - first <= CHATTER_WITHIN_NS for first, last in zip(times, times[2:], strict=False))

@@ -18,13 +18,15 @@ import msgspec
 
 from monitor_node.alarms.alarms import (
     LAST_NS,
+    Activation,
     AlarmChange,
     AlarmMemory,
     ChartAlarm,
+    Incident,
+    KpiCounter,
     SuspectedCause,
     TimeNs,
 )
-from monitor_node.alarms.incidents import Activation, Incident, KpiCounter
 from monitor_node.config import MonitorConfig, PriorityName
 from reactorwatch.contract import keys
 from reactorwatch.contract.alarm_states import CODES, UNACKNOWLEDGED_STATES, Event, State, is_consistent, next_state
@@ -143,12 +145,7 @@ class Annunciator:
     # --- rows ------------------------------------------------------------------------------------------------
 
     def apply(self, time_ns: int, changes: Sequence[AlarmChange]) -> list[Publication]:
-        """Apply the changes of alarms that the stages of a row have found, in their order; returns their messages.
-
-        Args:
-            time_ns: time of the row.
-            changes: changes of alarms declared here.
-        """
+        """Apply the changes of alarms that the stages of a row have found, in their order; returns their messages."""
         publications: list[Publication] = []
         operation = self.describe_operation(time_ns) if changes else ""
         for change in changes:
@@ -174,11 +171,7 @@ class Annunciator:
         return publications
 
     def end_row(self, time_ns: int) -> list[Publication]:
-        """End shelving where its time is over; publish incidents that changed, and KPIs after a change and each minute.
-
-        Args:
-            time_ns: time of the row, which all charts have evaluated.
-        """
+        """End shelving whose time is over; publish changed incidents, and KPIs after a change and each minute."""
         memory = self.memory
         memory.time_ns = time_ns
         publications: list[Publication] = []

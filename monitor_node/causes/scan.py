@@ -6,7 +6,7 @@ likeliest size is a / b, its variance 1 / b, and twice the logarithm of the like
 over the rows gives all onsets of all causes: 0.7 ms for 600 rows.
 
 The signature is that of an infinitesimal size. A large fault soon leads the plant out of its range, so there are two
-scans: of the rows up to the first at which some cause stands out by `STANDS_OUT`, and of all.
+scans: of the rows up to the first at which some cause stands out, and of all.
 """
 
 from collections.abc import Iterable, Sequence
@@ -28,12 +28,6 @@ from reactorwatch.kalman.error_dynamics import ErrorDynamics
 from reactorwatch.process.effect import Effect, SensorEffect
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.stored_state import Memory
-
-STANDS_OUT = 60.0
-"""Twice a logarithm of a likelihood ratio."""
-
-REACH = 30.0
-"""Twice a logarithm of a likelihood ratio: an onset that is worse than the best one by more is out of question."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,17 +51,11 @@ class Scan:
     @property
     def stands_out(self) -> bool:
         """True if the likelihood ratio of some cause is that of more than noise."""
-        return bool(np.max(self.ratio) > STANDS_OUT)
+        return bool(np.max(self.ratio) > 60.0)
 
 
 class GlrScan:
-    """Scans windows of one plant.
-
-    Args:
-        model: process model of the plant.
-        noise: noise levels of the plant and its sensors.
-        effects: effects of the causes; none may add states.
-    """
+    """Scans windows of one plant."""
 
     def __init__(self, model: ProcessModel, noise: NoiseLevels, effects: Sequence[Effect]) -> None:
         self._lower = np.array([effect.lower for effect in effects])
@@ -102,7 +90,8 @@ class GlrScan:
         while early.rows - most_without > 1:
             middle = self._scan_rows(times, dynamics, first, (early.rows + most_without) // 2)
             early, most_without = (middle, most_without) if middle.stands_out else (early, middle.rows)
-        near = np.max(early.ratio, axis=(1, 2)) > np.max(early.ratio) - REACH
+        # a worse onset is out of question (twice a logarithm of a likelihood ratio)
+        near = np.max(early.ratio, axis=(1, 2)) > np.max(early.ratio) - 30.0
         before = max(int(np.argmax(near)) - 1, 0)
         arrays = (full.onset_min, full.size, full.ratio, full.information)
         return early, Scan(rows, *(item[before:] for item in arrays))
@@ -159,9 +148,7 @@ PROFILES: tuple[type[FittedProfile], ...] = (Step, Ramp)
 ALL_PROFILES: tuple[type[FittedProfile], ...] = (*PROFILES, EndedRamp)
 """Profiles that are fitted."""
 
-_FIRST_ROWS = 6
-_ENDS = (0.4, 0.6, 0.8, 0.95)  # shares of the time since the onset after which a ramp may have ended
-_WELL_INSIDE = 0.6  # fraction of a bound at which a fit starts if the linear size is beyond the bound
+_FIRST_ROWS = 6  # rows after the onset of the first fit to a large fault
 
 
 @dataclass(frozen=True, eq=False)
@@ -219,7 +206,7 @@ class Candidate:
         slope, span = self.parameters[0] / max(end_min - self.onset_min, 1e-9), last_min - self.onset_min
         trials = [
             replace(self, profile=EndedRamp, parameters=np.array([slope * age, self.onset_min, self.onset_min + age]))
-            for age in (share * span for share in _ENDS)
+            for age in (share * span for share in (0.4, 0.6, 0.8, 0.95))
         ]
         going_on = replace(self, profile=Ramp, parameters=np.array([slope * span, self.onset_min]))
         return trials if self.profile is Ramp else [*trials, going_on]
@@ -322,7 +309,8 @@ def scan_candidates(effects: Sequence[Effect], scan: Scan, window: Window) -> li
             span = end_min - onset_min if profile is Ramp else 1.0
             final = float(size[row, column]) * span
             if not effect.lower <= final <= effect.upper:
-                final = _WELL_INSIDE * min(max(final, effect.lower), effect.upper)
+                # well inside of its bound, where the linear size is beyond it
+                final = 0.6 * min(max(final, effect.lower), effect.upper)
             parameters, gain = np.array([final, onset_min]), 0.5 * float(ratio[row, column])
             sds = span * float(information[row, column]) ** -0.5, float(onset_sd_min[column])
             candidates.append(

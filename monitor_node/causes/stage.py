@@ -29,7 +29,7 @@ from monitor_node.learn.references import PlantEquations
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Publication
 from reactorwatch.contract.messages_pb2 import Reconstruction as ReconstructionMessage
-from reactorwatch.kalman.batch import STEPS_PER_PREDICTION, STEPS_PER_ROW, BudgetExceededError, StepBudget
+from reactorwatch.kalman.batch import BudgetExceededError, StepBudget, StepCost
 from reactorwatch.kalman.ekf import Filter, FilterState
 from reactorwatch.kalman.ekf_step import NoiseLevels
 from reactorwatch.process.effect import SensorEffect
@@ -46,16 +46,7 @@ FEW_ROWS = 300
 ROWS_BEFORE = 400
 """Number of rows before the first alarm that late looks use."""
 
-LEAST = 0.01
-"""Probability below which a suspect is not published."""
-
-CONVINCED = 0.5
-"""Probability from which a suspected sensor is reconstructed."""
-
-MARGIN_MIN = 1.0
-"""Time before the estimated onset from which the sensor is left out."""
-
-START_STEPS, START_STEPS_A_ROW = 25_000 + STEPS_PER_PREDICTION * MOST_PIECES, STEPS_PER_ROW
+START_STEPS, START_STEPS_A_ROW = 25_000 + StepCost.PREDICTION * MOST_PIECES, StepCost.ROW
 """Filter steps for the past rows: enough for each row and a search for steady states."""
 
 
@@ -63,10 +54,6 @@ def preparation(config: MonitorConfig, model: ProcessModel | None) -> Iterator[N
     """Compile what the first look for causes would compile, one part for each item of the iterator.
 
     All parts take about a second of processor time, or ten if nothing is in the cache on the disk.
-
-    Args:
-        config: settings of the monitor.
-        model: process model of the plant; None without one.
     """
     if model is None or not has_causes(config, model):
         return
@@ -125,11 +112,6 @@ class Reconstruction:
     balances and the other sensors. It is not corrected by the size of its fault: that would be only as good as the
     known form of the fault, and this holds for a sensor that drifts, sticks or fails in any other way. It costs some
     accuracy.
-
-    Args:
-        model: process model of the plant.
-        noise: noise levels of the plant and its sensors.
-        memory: the sensor, and the memory of an earlier reconstruction of it.
     """
 
     def __init__(self, model: ProcessModel, noise: NoiseLevels, memory: ReconstructionMemory) -> None:
@@ -145,7 +127,8 @@ class Reconstruction:
         self._filter.budget = StepBudget(START_STEPS + START_STEPS_A_ROW * len(past))
         try:
             for time_min, inputs, measured in past:
-                self._step(time_min, inputs, measured, is_right=time_min < onset_min - MARGIN_MIN)
+                # the sensor is left out from a minute before the estimated onset on
+                self._step(time_min, inputs, measured, is_right=time_min < onset_min - 1.0)
         except BudgetExceededError:  # the filter diverges again and again: start with the next row instead
             self._filter.restart()
         self._filter.budget, self.memory.filter = None, self._filter.state
@@ -154,11 +137,6 @@ class Reconstruction:
         """Process a row and return the true reading without noise and its standard deviation, in the output's unit.
 
         Both are NaN in the row with which the filter starts.
-
-        Args:
-            time_min: time of the row.
-            inputs: one value an input; NaN if missing: the last known one then holds.
-            measured: values of all sensors; NaN where missing.
         """
         return self._step(time_min, inputs, measured, is_right=False)
 
@@ -180,12 +158,6 @@ class Reconstruction:
 
 class Suspicion:
     """Searches the causes of one plant's alarms.
-
-    Args:
-        config: settings of the monitor.
-        board: annunciator of the plant.
-        reference: equations by which the rows are predicted.
-        memory: memory of another search for the same plant, from which this one resumes; None: it starts.
 
     Raises:
         ValueError: the memory is damaged.
@@ -215,15 +187,7 @@ class Suspicion:
     def update(
         self, time_ns: int, inputs: Sequence[float], values: list[float], units: list[str], stuck: list[bool]
     ) -> list[Publication]:
-        """Process a row after its alarms.
-
-        Args:
-            time_ns: time of the row.
-            inputs: one value an input; NaN if missing.
-            values: outputs; NaN where missing.
-            units: units of the outputs.
-            stuck: flags of the outputs whose sensors are stuck; their values are missing.
-        """
+        """Process a row after its alarms; values of stuck sensors are missing."""
         time_min, since = time_ns / MINUTE_NS, self.memory.since
         publications: list[Publication] = []
         rows = self.memory.rows
@@ -284,7 +248,7 @@ class Suspicion:
         isolation.fitter.progress = self.memory.progress
         suspects = isolation.suspects(self._rows_of_look(since), min(since, FEW_ROWS))
         self.memory.progress = isolation.fitter.progress
-        shown = [item for item in suspects if item.probability >= LEAST]
+        shown = [item for item in suspects if item.probability >= 0.01]
         self._board.set_suspects(shown, stopped=isolation.stopped)
         self._follow(suspects[0])
 
@@ -308,7 +272,7 @@ class Suspicion:
         """Start or stop the reconstruction of a sensor."""
         effect = self._effects.get(suspect.cause)
         output = effect.output if isinstance(effect, SensorEffect) else ""
-        if suspect.probability >= CONVINCED and output in self._config.outputs:
+        if suspect.probability >= 0.5 and output in self._config.outputs:
             self._reconstruct(output, suspect.cause, suspect.onset_ns / MINUTE_NS, self.memory.rows.rows())
         elif self._reconstructed_cause != STUCK_SENSOR:
             self._stop_reconstruction()

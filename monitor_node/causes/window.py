@@ -33,19 +33,9 @@ Row: TypeAlias = tuple[float, Sequence[float], Sequence[float]]
 BURN_IN_ROWS = 20
 """Number of rows at the start in which the filter settles: no onset is sought there."""
 
-_OF_THREE = 1.5**0.5  # standard deviation of a value minus the mean of its neighbours, for white noise
-
-GAP_PERIODS = 5.0
-"""Median periods beyond which an interval is a gap, in which the input is unknown."""
-
 MOST_PIECES = 6_000
 """Largest number of additional pieces of two integration steps in the intervals of a window: 600 rows that are a minute
 apart. A filter takes some microseconds for each piece, so fewer rows are used if they are farther apart."""
-
-_CHUNK_ROWS = 16
-
-SLACK_ROWS = 64
-"""Rows by which more are stored before the oldest are removed together: that moves all others."""
 
 
 class RecentRows(Memory):
@@ -55,7 +45,7 @@ class RecentRows(Memory):
         n_inputs: number of inputs.
         columns: numbers of a row: time in minutes, inputs, outputs.
         most: number of rows that are kept.
-        numbers: the rows one after the other, oldest first; up to `SLACK_ROWS` more than are kept.
+        numbers: the rows one after the other, oldest first; up to 64 more than are kept.
     """
 
     n_inputs: int
@@ -76,7 +66,8 @@ class RecentRows(Memory):
         if not is_later:
             del self.numbers[:]
         self.numbers.extend(row)
-        if len(self.numbers) > (self.most + SLACK_ROWS) * self.columns:
+        # the oldest are removed together, since that moves all others
+        if len(self.numbers) > (self.most + 64) * self.columns:
             self.keep(self.most)
         return is_later
 
@@ -171,7 +162,7 @@ def _run_filter(
     states = np.zeros((rows, n_x)), np.zeros((rows, n_x, n_x))
     run = _FilterRun(nothing, nothing.copy(), no_flags, no_flags.copy(), *states)
     kalman.restart()
-    row, chunk, accept = 0, _CHUNK_ROWS, np.zeros(n_y, dtype=bool)
+    row, chunk, accept = 0, 16, np.zeros(n_y, dtype=bool)
     while row < rows:
         part = slice(row, row + 1 if accept.any() else min(row + chunk, rows))
         later = None if uncertainty is None else uncertainty.select(part)
@@ -196,17 +187,12 @@ def _run_filter(
         if last + 1 < part.stop:
             belief = tuple(run.x[last].tolist()), tuple(run.covariance[last].ravel().tolist())
             kalman.state = FilterState(float(times[last]), tuple(inputs[last].tolist()), *belief)
-        row, accept, chunk = last + 1, run.far[last], _CHUNK_ROWS if beyond.size else 2 * chunk
+        row, accept, chunk = last + 1, run.far[last], 16 if beyond.size else 2 * chunk
     return run
 
 
 def newest_rows(rows: Sequence[Row], least: int = 0) -> Sequence[Row]:
-    """Select the newest rows whose intervals have at most `MOST_PIECES` additional pieces.
-
-    Args:
-        rows: rows, oldest first.
-        least: number of rows to keep in any case.
-    """
+    """Select the newest rows whose intervals have at most `MOST_PIECES` additional pieces."""
     apart = np.diff([row[0] for row in rows])
     pieces = np.where((apart > 0.0) & (apart <= LONGEST_GAP_MIN), np.ceil(apart / LONGEST_ROW_MIN) - 1.0, 0.0)
     before = int(np.searchsorted(np.cumsum(pieces[::-1]), MOST_PIECES, side="right")) + 1
@@ -233,7 +219,8 @@ def _stands_out(values: Array, sd: Array) -> NDArray[np.bool_]:
             before, after = column[finite[: -count - 1]], column[finite[count + 1 :]]
             between = [finite[index : finite.size - count - 1 + index] for index in range(1, count + 1)]
             usual, apart = 0.5 * (before + after), np.abs(after - before)
-            least = [np.maximum(GATE * _OF_THREE * sizes[now], apart) for now in between]
+            # 1.5 ** 0.5: standard deviation of a value minus the mean of its neighbours, white noise
+            least = [np.maximum(GATE * (1.5**0.5) * sizes[now], apart) for now in between]
             far = [np.abs(column[now] - usual) > size for now, size in zip(between, least, strict=True)]
             for now in between:
                 out[now[np.logical_and.reduce(far)]] = True
@@ -264,5 +251,6 @@ def rows_since_break(rows: Sequence[Row]) -> list[Row]:
     if len(kept) < 2:
         return kept
     apart = np.diff([row[0] for row in kept])
-    gaps = np.flatnonzero(apart > min(GAP_PERIODS * float(np.median(apart)), LONGEST_GAP_MIN))
+    # in an interval of more than five median periods the input is unknown
+    gaps = np.flatnonzero(apart > min(5.0 * float(np.median(apart)), LONGEST_GAP_MIN))
     return kept[int(gaps[-1]) + 1 :] if gaps.size else kept

@@ -11,11 +11,11 @@ from reactorwatch.contract import keys
 from reactorwatch.spc import false_alarm_budget
 from reactorwatch.spc.charts.base import Baseline, Chart, JointChart, SignalChart, complete_rows
 from reactorwatch.spc.charts.catalogue import chart
+from reactorwatch.spc.charts.value_chart import ValueBaseline, ValueChart
 from reactorwatch.spc.detection import Detector
 from reactorwatch.spc.false_alarm_budget import TrainingErrors
 from reactorwatch.spc.prewhitening import Prewhitening, memory_sds
 from reactorwatch.spc.run_length import false_alarm_rates
-from reactorwatch.spc.value_chart import ValueBaseline, ValueChart
 
 ALL = "all"
 """Name in place of a signal for charts of all outputs together."""
@@ -53,9 +53,6 @@ def _count_alarms(names: Iterable[str], outputs: int, signals: int) -> int:
 
 class ChartDesign:
     """Design of the charts of one plant.
-
-    Args:
-        config: configuration of the monitor.
 
     Attributes:
         names: charts of the settings, and those that may take their place.

@@ -26,16 +26,13 @@ from reactorwatch.contract.messages_pb2 import ChartPoint
 from reactorwatch.spc.charts.base import Chart, JointChart, Judgement, Shown, SignalChart
 from reactorwatch.spc.charts.catalogue import chart
 from reactorwatch.spc.charts.shewhart import designed_width
+from reactorwatch.spc.charts.value_chart import ValueChart
 from reactorwatch.spc.compiled_chart import Bank, CompiledChart, SignalMemory
 from reactorwatch.spc.prewhitening import Prewhitening
-from reactorwatch.spc.value_chart import ValueChart
 from reactorwatch.stored_state import Memory, read_memory
 
 SD = "sd"
 """The unit of what charts show: standard deviations of the residual."""
-
-MOST_ENTRIES = 3
-"""Signals that an alarm names as possible entries of a disturbance."""
 
 
 class ChartsMemory(Memory):
@@ -171,12 +168,7 @@ class _Single(_Charts, Generic[Joined]):
 
 
 class _OfAll(_Single[JointChart]):
-    """A chart of all outputs together.
-
-    Args:
-        joint: the chart.
-        evaluated: for each output, True if the chart uses it.
-    """
+    """A chart of all outputs together."""
 
     def __init__(self, joint: JointChart, evaluated: list[bool]) -> None:
         super().__init__(joint)
@@ -194,12 +186,7 @@ class _OfAll(_Single[JointChart]):
 
 
 class _OfValues(_Single[ValueChart]):
-    """A chart of the measured values of all signals.
-
-    Args:
-        values: the chart.
-        config: configuration of the monitor.
-    """
+    """A chart of the measured values of all signals."""
 
     def __init__(self, values: ValueChart, config: MonitorConfig) -> None:
         super().__init__(values)
@@ -220,10 +207,6 @@ class _OfValues(_Single[ValueChart]):
 
 class ChartWatch:
     """The charts of one plant.
-
-    Args:
-        config: configuration of the monitor.
-        board: the alarms of the plant; those of the charts are declared here.
 
     Attributes:
         design: design of the charts; choose the charts by it before `start`.
@@ -274,12 +257,7 @@ class ChartWatch:
             alarm.memory.recent, alarm.memory.in_a_row = recent, in_a_row
 
     def points(self, time_ns: int, points: Array) -> list[Publication]:
-        """Publications of points of all charts.
-
-        Args:
-            time_ns: time of the row.
-            points: numbers of a `Judgement` in each row, one row an alarm; shape (at least the number of alarms, 5).
-        """
+        """Publications of points of all charts."""
         paths = [path for charts in self._watched.values() for path in charts.keys]
         judgements = [
             Judgement(statistic, centre, lower, upper, out > 0.0)
@@ -318,10 +296,6 @@ class ChartWatch:
 
     def resume(self, memory: ChartsMemory, evaluated: list[bool]) -> None:
         """Go on, bit for bit, from the memory of charts with the same settings; after the board.
-
-        Args:
-            memory: memory of the other charts, as it was read.
-            evaluated: for each output, True if it is evaluated.
 
         Raises:
             ValueError: the memory is damaged.
@@ -390,7 +364,7 @@ class ChartWatch:
         known = [size == size for size in e]  # NaN is not equal to itself
         seen, changes = _ChartRow(e, known, withheld, row.inputs, row.values), list[AlarmChange]()
         for charts in self._watched.values():
-            always = points or not all(alarm.is_idle for alarm in charts.alarms)
+            always = points or any(alarm.memory.standing or alarm.memory.recent for alarm in charts.alarms)
             for index, judgement in enumerate(charts.update(seen, always=always) or ()):
                 if judgement is None:
                     continue
@@ -409,7 +383,7 @@ class ChartWatch:
                     if charts.locates:
                         change.entries = [
                             SuspectedCause(name, share, kind="process", text=f"the disturbance enters at {name}")
-                            for name, share in islice(change.contributions.items(), MOST_ENTRIES)
+                            for name, share in islice(change.contributions.items(), 3)
                         ]
                 else:
                     charts.restart(index)

@@ -12,7 +12,7 @@ import numpy as np
 from monitor_node.alarms.alarms import AlarmChange, SuspectedCause
 from monitor_node.alarms.annunciator import Annunciator
 from monitor_node.config import MonitorConfig
-from monitor_node.learn.signal_range import SignalRange
+from monitor_node.watched_process import SignalRange
 from reactorwatch.arrays import Array
 from reactorwatch.spc.charts.base import Judgement
 from reactorwatch.spc.false_alarm_budget import TrainingErrors

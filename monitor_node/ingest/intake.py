@@ -1,29 +1,144 @@
-"""Way of a plant's samples from messages to rows: each sample is checked, converted, and aligned with the others."""
+"""Samples of a plant from messages to rows: each is checked, converted to the unit of its signal, and aligned. Pure."""
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from math import isfinite
 
 import msgspec
 
 from monitor_node.config import MonitorConfig
-from monitor_node.ingest.alignment import Aligner
-from monitor_node.ingest.duplicates import AlignmentMemory, ReplayFilter
-from monitor_node.ingest.rows import Row
-from monitor_node.ingest.samples import (
-    LARGEST_NUMBER,
-    LARGEST_SAMPLE,
-    LARGEST_VALUE,
-    USABLE,
-    RejectCounter,
-    SampleUnits,
-    UnusableSamples,
-    reject_reason,
-)
+from monitor_node.ingest.rows import Aligner, AlignmentMemory, ReplayFilter, Row
 from monitor_node.ingest.sequence_check import HeldSample, SequenceCheck
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import OTHER_VERSION, DecodeError, Encoded, Publication, decode
-from reactorwatch.contract.messages_pb2 import Sample
+from reactorwatch.contract.messages_pb2 import Quality, Sample
 from reactorwatch.errors import InputError
+from reactorwatch.records.record import LARGEST_VALUE
 from reactorwatch.stored_state import Memory
+from reactorwatch.units import conversion
+
+USABLE = frozenset({Quality.QUALITY_GOOD, Quality.QUALITY_UNCERTAIN})
+"""Qualities of samples that are used."""
+
+LONGEST_EXAMPLE = 300
+"""Characters. Senders control this text; truncate it."""
+
+SAME = (1.0, 0.0)
+"""Conversion of a unit to itself, or to another spelling of it."""
+
+
+def reject_reason(signal: str, sample: Sample) -> tuple[str, str]:
+    """Reason to reject a sample, and a description of it."""
+    if sample.quality == Quality.QUALITY_UNSPECIFIED:
+        return "payload", f"{signal}: the sample has no quality, so it is no Sample of reactorwatch"
+    if not isfinite(sample.value):
+        return "not_finite", f"{signal} is {sample.value} at {sample.time_ns} ns"
+    if sample.quality == Quality.QUALITY_BAD:
+        return "bad_quality", f"{signal} is marked bad at {sample.time_ns} ns"
+    if sample.quality not in USABLE:
+        return "bad_quality", f"{signal} has the quality {sample.quality}, which this version does not know"
+    return "out_of_range", f"{signal} is {sample.value} at {sample.time_ns} ns: sizes must be below {LARGEST_VALUE:g}"
+
+
+class SampleUnits:
+    """Converts the samples of a plant; those of signals without a unit here are judged in the units that they come in.
+
+    Attributes:
+        plain: newest unit by signal that needed no conversion.
+    """
+
+    def __init__(self, declared: Mapping[str, str], model_units: Mapping[str, str]) -> None:
+        self._wanted, self._declared = {**declared, **model_units}, dict(declared)
+        self.plain: dict[str, str] = {}
+        self._conversions: dict[tuple[str, str], tuple[float, float] | InputError] = {}
+
+    def convert(self, signal: str, unit: str, value: float) -> tuple[float, str]:
+        """Value and unit of a sample.
+
+        Raises:
+            InputError: the unit is unknown, or measures another quantity.
+        """
+        wanted = self._wanted.get(signal, unit)
+        scale, offset = SAME if unit == wanted else self._conversion(signal, unit, wanted)
+        if (scale, offset) == SAME:
+            self.plain[signal] = unit
+            return value, unit
+        return scale * value + offset, wanted
+
+    def _conversion(self, signal: str, unit: str, wanted: str) -> tuple[float, float]:
+        """Scale and offset of a unit, found once for each signal and unit."""
+        known = self._conversions.get((signal, unit))
+        if known is None:
+            try:
+                known = conversion(unit or self._declared.get(signal, wanted), wanted, f"sample of {signal}")
+            except InputError as error:
+                known = error
+            # publishers choose the texts
+            if len(self._conversions) < 1000:
+                self._conversions[signal, unit] = known
+        if isinstance(known, InputError):
+            raise known
+        return known
+
+
+class UnusableSamples(Memory, kw_only=True):
+    """Samples of a plant's own signals that were refused as samples, since the newest that was used.
+
+    Attributes:
+        reasons: text of the reason by signal, for signals whose newest sample was refused.
+        in_a_row: number of samples refused since the newest usable one of any signal.
+    """
+
+    reasons: dict[str, str] = msgspec.field(default_factory=dict)
+    in_a_row: int = 0
+
+    def add(self, signal: str, reason: str) -> None:
+        """Count a refused sample."""
+        self.reasons[signal] = reason[:LONGEST_EXAMPLE]
+        self.in_a_row += 1
+
+    def clear(self, signal: str) -> None:
+        """Note a usable sample."""
+        self.reasons.pop(signal, None)
+        self.in_a_row = 0
+
+
+@dataclass
+class RejectCounter:
+    """Counter of rejected messages.
+
+    Attributes:
+        by_reason: number of rejected messages by reason since the start.
+    """
+
+    by_reason: dict[str, int] = field(default_factory=dict)
+    _pending_report: dict[str, str] = field(default_factory=dict)
+    _last_report_ns: int | None = None
+
+    def add(self, reason: str, example: str) -> None:
+        """Count a message; `example` describes it."""
+        self.by_reason[reason] = self.by_reason.get(reason, 0) + 1
+        if reason not in self._pending_report:
+            is_long = len(example) > LONGEST_EXAMPLE
+            self._pending_report[reason] = f"{example[:LONGEST_EXAMPLE]}..." if is_long else example
+
+    @property
+    def total(self) -> int:
+        """Total over all reasons."""
+        return sum(self.by_reason.values())
+
+    def report(self, now_ns: int) -> str | None:
+        """One line on messages rejected since the last report; None if there are none, or the report is too recent."""
+        if not self._pending_report or (
+            self._last_report_ns is not None and now_ns - self._last_report_ns < 60_000_000_000
+        ):
+            return None
+        self._last_report_ns = now_ns
+        examples = "; ".join(
+            f"{reason} ({self.by_reason[reason]} so far): {text}" for reason, text in self._pending_report.items()
+        )
+        self._pending_report.clear()
+        return f"refused messages: {examples}"
 
 
 class IntakeMemory(Memory, kw_only=True):
@@ -102,12 +217,7 @@ class SampleIntake:
         return self._replay_filter is not None and not self._replay_filter.has_begun
 
     def take(self, messages: Sequence[Encoded], publications: list[Publication]) -> bool:
-        """Process messages on keys of the plant's samples; returns True if a sample was accepted.
-
-        Args:
-            messages: the messages, in order.
-            publications: list to which publications are added.
-        """
+        """Process messages on keys of the plant's samples; returns True if a sample was accepted."""
         is_accepted = False
         for key, payload, encoding, _ in messages:
             signal = self._signal_by_key.get(key)
@@ -115,7 +225,8 @@ class SampleIntake:
                 if key not in self._label_keys:
                     self.rejects.add("unknown_signal", f"{key} is none of {', '.join(self._config.signals)}")
                 continue
-            if len(payload) > LARGEST_SAMPLE:
+            # a sample takes some thirty bytes and its unit
+            if len(payload) > 1000:
                 self.rejects.add("too_large", f"{key}: {len(payload)} bytes are no Sample")
                 continue
             try:
@@ -166,7 +277,8 @@ class SampleIntake:
     def _check_sequence(self, index: int, signal: str, sample: HeldSample, publications: list[Publication]) -> bool:
         """Process a sample that is not the expected one of its run; returns True if one was accepted."""
         run, time_ns, number = self.memory.runs[index], sample.time_ns, sample.number
-        if not (number < LARGEST_NUMBER and abs(time_ns) < LARGEST_NUMBER):
+        # sums must still fit into a message
+        if not (number < 2**62 and abs(time_ns) < 2**62):
             text = f"{signal} number {number} at {time_ns} ns: no plant counts or lasts so far"
             self.rejects.add("out_of_range", text)
             return False

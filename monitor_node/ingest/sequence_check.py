@@ -28,7 +28,7 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import NamedTuple
 
-from monitor_node.ingest.alignment import REMEMBERED
+from monitor_node.ingest.rows import REMEMBERED
 from reactorwatch.runtime.gap_tracker import GapTracker
 from reactorwatch.spc.silence import Spacing
 
@@ -41,12 +41,6 @@ TOLERANCE, DEVIATIONS = 0.25, 4.0
 
 MEMORY = 16
 """Spacings in the exponential mean, and needed before their evenness is checked."""
-
-AT_FIRST = 4.0
-"""Times the mean spacing, allowed before it is known."""
-
-ALIKE = 0.01
-"""Share of the usual spacing: a smaller deviation does not update the mean."""
 
 
 def is_alike(usual: Spacing, spacing_ns: float) -> bool:
@@ -82,7 +76,7 @@ class SequenceCheck(GapTracker):
         if self.held or number != self.expected or usual.count < MEMORY:
             return False
         spacing_ns = float(time_ns - self.newest_ns)
-        if abs(spacing_ns - usual.mean_ns) > ALIKE * usual.mean_ns:
+        if abs(spacing_ns - usual.mean_ns) > 0.01 * usual.mean_ns:
             if not is_alike(usual, spacing_ns):
                 return False
             usual.learn(spacing_ns, MEMORY)
@@ -90,12 +84,7 @@ class SequenceCheck(GapTracker):
         return True
 
     def update(self, sample: HeldSample, reorder_rows: int) -> tuple[list[HeldSample], list[HeldSample]]:
-        """Update with a sample; returns accepted samples and rejected samples.
-
-        Args:
-            sample: the new sample.
-            reorder_rows: see the alignment.
-        """
+        """Update with a sample; returns accepted samples and rejected samples."""
         held, window = self.held, REMEMBERED * reorder_rows
         follows = self._follows(sample, window)
         if not held:
@@ -179,5 +168,5 @@ class SequenceCheck(GapTracker):
             return False
         spacing_ns, usual = time_ns / numbers, self.spacing
         if usual.count < MEMORY:
-            return not usual.count or spacing_ns <= AT_FIRST * usual.mean_ns
+            return not usual.count or spacing_ns <= 4.0 * usual.mean_ns
         return is_alike(usual, spacing_ns)

@@ -30,7 +30,7 @@ from msgspec.structs import replace
 
 from monitor_node.config import MonitorConfig
 from monitor_node.ingest.rows import MeasuredRow
-from monitor_node.learn.references import Reference, RowPrediction
+from monitor_node.learn.references import COPY_ROWS, Reference, RowPrediction
 from reactorwatch.arrays import Array
 from reactorwatch.identification.data import Rows
 from reactorwatch.identification.rls import RecursiveLeastSquares, RlsMemory
@@ -41,17 +41,11 @@ from reactorwatch.spc.charts.base import Judgement
 from reactorwatch.spc.charts.parameters import ParameterT2
 from reactorwatch.stored_state import Memory, copy_of
 
-SCALING_ROWS = 50
-"""Rows from which the scaling is made; there is no prediction before."""
-
 MEMORY = 10_000
 """Rows after which an adaptive model that judges has forgotten a row."""
 
 JUDGING_FORGETTING = 1.0 - 1.0 / MEMORY
 """Least forgetting factor of an adaptive model that judges."""
-
-COPY_ROWS = 250
-"""Rows between two copies of an adaptive model that judges."""
 
 
 def arx_structure(config: MonitorConfig) -> Structure:
@@ -97,8 +91,7 @@ class LaggedRows(Memory, dict=True):
     inputs: list[float] = msgspec.field(default_factory=list)
 
     def __post_init__(self) -> None:
-        structure = self.structure
-        self._history = structure.history
+        structure, self._history = self.structure, self.structure.history
         if len(self.inputs) != len(self.outputs) * structure.inputs or len(self.outputs) > self._history:
             raise ValueError(f"there must be at most {self._history} equal rows, got {len(self.outputs)}")
         first = structure.delay - 1
@@ -112,10 +105,6 @@ class LaggedRows(Memory, dict=True):
         """Add a row; returns its regressor, shape (parameters,).
 
         None if it cannot be predicted, as there are too few complete rows just before it, or misses a value.
-
-        Args:
-            inputs: one value an input; NaN if missing.
-            output: value of the output; NaN if missing.
         """
         if not (isfinite(output) and all(map(isfinite, inputs))):
             self.restart()
@@ -176,12 +165,7 @@ class ArxPredictor(Memory, dict=True):
 
     @classmethod
     def of(cls, structure: Structure, forgetting: float) -> Self:
-        """Predictor that knows nothing.
-
-        Args:
-            structure: structure of the models.
-            forgetting: forgetting factor of the adaptive model.
-        """
+        """Predictor that knows nothing."""
         return cls(structure, RecursiveLeastSquares(structure.parameters, forgetting), LaggedRows(structure))
 
     @property
@@ -191,13 +175,7 @@ class ArxPredictor(Memory, dict=True):
         return slice(first, first + self.structure.input_lags * self.structure.inputs)
 
     def update(self, inputs: Sequence[float], value: float, *, follows: bool) -> float:
-        """Update with a row; returns the prediction made before it, NaN if there is none.
-
-        Args:
-            inputs: one value an input; NaN if missing.
-            value: output; NaN if missing.
-            follows: True if the row before was one period ago.
-        """
+        """Update with a row; returns the prediction made before it, NaN if there is none."""
         if self.scaling is None:
             self._learn_scaling(inputs, value)
             return nan
@@ -223,7 +201,7 @@ class ArxPredictor(Memory, dict=True):
         if not all(map(isfinite, row)):
             return
         self.first_rows.append(row)
-        if len(self.first_rows) == SCALING_ROWS:
+        if len(self.first_rows) == 50:
             rows = np.array(self.first_rows)
             self._scale(Scaling.of(rows[:, :-1], rows[:, -1]))
             self.first_rows.clear()
@@ -318,10 +296,6 @@ class ArxMemory(Memory, tag="arx"):
 class ArxReference(Reference):
     """Identified models of one plant, one an output.
 
-    Args:
-        config: settings of the monitor.
-        points: True to publish predictions.
-
     Attributes:
         config: settings of the monitor.
         points: True to publish predictions.
@@ -346,10 +320,6 @@ class ArxReference(Reference):
     def resume(self, predictors: Sequence[ArxPredictor], *, follows: bool) -> None:
         """Resume from models of the same settings.
 
-        Args:
-            predictors: the models, which are copied.
-            follows: True if the next row follows the ones before.
-
         Raises:
             ValueError: the models are of other settings.
         """
@@ -372,8 +342,7 @@ class ArxReference(Reference):
             raise ValueError(f"rows before must have shape {shape}, got {memory.past.shape}")
         self._memory, self.obstacles = memory, {}
         self._uses_inputs = np.array([predictor.structure.inputs > 0 for predictor in self.predictors])
-        ranges = zip(memory.low, memory.high, strict=True)
-        self._ranges = list(enumerate(ranges)) if self._uses_inputs.any() else []
+        self._ranges = list(enumerate(zip(memory.low, memory.high, strict=True))) if self._uses_inputs.any() else []
         if memory.past is not None:
             self._set_matrices(*shape)
 

@@ -24,16 +24,6 @@ from reactorwatch.spc.charts.parameters import learn
 ROWS_A_PARAMETER = 10
 """Least number of rows per parameter of a fitted model."""
 
-MARGIN = 0.1
-"""Share of an input's range in training by which it may be beyond it."""
-
-MOST_LEVERAGE = 0.2
-"""Largest variance of a prediction due to an input's coefficient, in variances of the residual. Several inputs are
-often those of controllers, which leave their range with a fault: rows are judged as far as models are determined."""
-
-MOSTLY = 0.5
-"""Least share of the output's values that a simpler structure must predict; it is no cure for irregular rows."""
-
 
 def fewest_rows(structure: Structure) -> int:
     """Least number of consecutive rows for a fitted model of a structure."""
@@ -57,10 +47,6 @@ def _learn_again(models: ArxReference, index: int, structure: Structure, rows: R
 
 def fit_models(models: ArxReference, rows: RowArrays) -> Array:
     """Fit each model to a training, with the largest structure that its rows allow.
-
-    Args:
-        models: the models; one that gets another structure is updated with the rows again.
-        rows: rows of the training.
 
     Returns:
         Residuals, shape (n, outputs), scaled to the size of out-of-sample residuals; NaN if missing. With too few rows
@@ -103,7 +89,8 @@ def _fitting_structure(structure: Structure, rows: RowArrays, outputs: Array) ->
         count = len(_consecutive_rows(item, rows.time_min, rows.inputs[:, : item.inputs], outputs).outputs)
         if count >= max(least, ROWS_A_PARAMETER * item.parameters):
             return item
-        least = MOSTLY * np.count_nonzero(np.isfinite(outputs))
+        # a simpler structure is no cure for irregular rows
+        least = 0.5 * np.count_nonzero(np.isfinite(outputs))
     return None
 
 
@@ -150,10 +137,12 @@ def start_judging(models: ArxReference, rows: RowArrays) -> None:
     """Judge the rows after a training by the models; each input must have values."""
     time_min, inputs, outputs = rows
     low, high = np.nanmin(inputs, axis=0), np.nanmax(inputs, axis=0)
-    margin = MARGIN * (high - low)
+    margin = 0.1 * (high - low)
     if inputs.shape[1] > 1:  # an input that did not move has no coefficient
         values = np.count_nonzero(np.isfinite(inputs), axis=0)
-        reach = np.where(high > low, np.nanstd(inputs, axis=0) * np.sqrt(MOST_LEVERAGE * values), np.inf)
+        # Several inputs are often those of controllers, which leave their range with a fault. So rows are judged as far
+        # as models are determined: to a variance of 0.2 of the residual's due to the coefficient of an input.
+        reach = np.where(high > low, np.nanstd(inputs, axis=0) * np.sqrt(0.2 * values), np.inf)
         margin = np.maximum(margin, reach - 0.5 * (high - low))
     memory = ArxMemory((low - margin).tolist(), (high + margin).tolist())
     if models.config.has_values_only:
@@ -169,10 +158,6 @@ def start_judging(models: ArxReference, rows: RowArrays) -> None:
 
 def start_drift_chart(model: ArxPredictor, arl0: float) -> None:
     """Start the chart of the difference between the parameters of the adaptive model and the fitted one.
-
-    Args:
-        model: model of an output.
-        arl0: in-control run length of the chart, in rows.
 
     Raises:
         InputError: the training was too short for that, or the model does not forget.
@@ -197,16 +182,7 @@ def adaptive_snapshot(model: ArxPredictor) -> ModelSnapshot | None:
 def _snapshot(
     model: ArxPredictor, parameters: Array, covariance: Array, condition: float, rows: int, forgetting: float
 ) -> ModelSnapshot:
-    """Snapshot in the signals' units, without a time.
-
-    Args:
-        model: model of an output.
-        parameters: parameters for scaled signals, shape (parameters,).
-        covariance: covariance of `parameters`, shape (parameters, parameters).
-        condition: condition number of the regressors.
-        rows: number of rows that the model has learned from.
-        forgetting: forgetting factor.
-    """
+    """Snapshot in the signals' units, without a time."""
     assert model.scaling is not None
     structure, (matrix, shift) = model.structure, model.scaling.unscaling(model.structure)
     values, sds = matrix @ parameters + shift, standard_deviations(covariance, matrix)

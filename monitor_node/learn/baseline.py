@@ -22,7 +22,6 @@ from monitor_node.learn.arx import ArxReference, arx_structure
 from monitor_node.learn.black_box_reference import BlackBoxReference
 from monitor_node.learn.process_reference import ProcessReference
 from monitor_node.learn.references import Reference
-from monitor_node.learn.signal_range import possible_ranges
 from monitor_node.learn.training_rows import (
     AfterMoves,
     RowArrays,
@@ -31,6 +30,7 @@ from monitor_node.learn.training_rows import (
     compare_after_moves,
     screen_baseline,
 )
+from monitor_node.watched_process import possible_ranges
 from reactorwatch.arrays import Array
 from reactorwatch.contract.messages_pb2 import Check
 from reactorwatch.errors import InputError
@@ -43,29 +43,12 @@ from reactorwatch.spc.step_test import ROWS as STEP_ROWS
 FEWEST_ROWS = 50
 """Least number of residuals; the training continues until there are as many."""
 
-FEWEST_FAMILIAR_ROWS = 200
-"""Least number of rows of a training after which `auto` takes a black box: after fewer, too many values of the inputs
-are unfamiliar to it, and it judges too few rows."""
-
 MINOR = 0.2
 """Share of the smallest relevant standard deviation (of the filter: of the residual's) below which a deviation of a few
 times as much does not make an interval disturbed."""
 
-AS_WELL = 1.5
-"""Largest ratio of prewhitened residuals, process to identified model, for which `auto` uses the process model. It is
-above 1, as the process model holds where the input goes beyond the training."""
-
-USUAL_SHARE = 0.9
-"""Least share of rows without a defect; with fewer, the defect is the reason why outputs could not be predicted."""
-
 NO_VALUE = "no value of it has come"
 """Reason for leaving a signal without values out."""
-
-FEWEST_MOVES = 5
-"""Moves of an input without which nothing checks how a model without equations follows it."""
-
-MOST_OUT_OF_RANGE = 1.0 / 3.0
-"""Share of impossible values of a signal; with more of them the plant is not the model's process."""
 
 NOTHING_LEARNED = Prewhitening(0.0, (), 1.0, FEWEST_ROWS, 0.5 / FEWEST_ROWS, 0.0)
 """Prewhitening of an output that is left out and not evaluated."""
@@ -114,20 +97,12 @@ class TrainingResult(NamedTuple):
 
         Where it did not determine the dynamics, each new set point may raise every alarm, and the next may come within
         the length of the training.
-
-        Args:
-            arl0: in-control run length of each alarm, in rows.
         """
         return max(self.after_moves.excess_rate(arl0), arl0 / len(self.z) if self.weakness else 0.0)
 
 
 def fewest_values(config: MonitorConfig, model: ProcessModel | None) -> int:
-    """Least number of values of each output that a training needs.
-
-    Args:
-        config: settings of the monitor.
-        model: process model; None: there is none.
-    """
+    """Least number of values of each output that a training needs."""
     structure = arx_structure(config)
     of_one_input = replace(structure, inputs=min(structure.inputs, 1))
     return FEWEST_ROWS if model is not None else max(arx_fit.fewest_rows(of_one_input), FEWEST_ROWS)
@@ -257,7 +232,8 @@ class _Choice:
         if equations is not None and (wanted == "equations" or _predicts_as_well(equations, identified)):
             return equations
         is_driven = bool(self._config.inputs and self._has_all_inputs)  # without inputs there is nothing to simulate
-        is_long = len(self.rows.time_min) >= FEWEST_FAMILIAR_ROWS
+        # after fewer, too many values of the inputs are unfamiliar to a black box, and it judges too few rows
+        is_long = len(self.rows.time_min) >= 200
         if wanted == "black-box" or (wanted == "auto" and is_driven and is_long):
             black_box = self._fit_black_box()
             if black_box is not None:
@@ -271,7 +247,7 @@ class _Choice:
         columns, ranges = np.column_stack(self.rows[1:]), possible_ranges(self._config, model)
         lower, upper = np.array([(item.lower, item.upper) for item in ranges]).T
         out = np.isfinite(columns) & ((columns < lower) | (columns > upper))
-        if self._config.reference != "equations" and np.any(np.mean(out, axis=0) > MOST_OUT_OF_RANGE):
+        if self._config.reference != "equations" and np.any(np.mean(out, axis=0) > 1.0 / 3.0):
             return None
         inputs, outputs = np.hsplit(np.where(out, np.nan, columns), [len(self._config.inputs)])
         possible = RowArrays(self.rows.time_min, inputs, outputs)
@@ -345,11 +321,7 @@ def _simplification(has: Structure, wanted: Structure) -> str:
 def _few_moves(names: tuple[str, ...], inputs: Array) -> str:
     """Reason why the training cannot show how the outputs follow an input that hardly ever moved; empty if it can."""
     counts = np.count_nonzero(np.nan_to_num(np.diff(inputs, axis=0)), axis=0).tolist()
-    few = [
-        f"{name} ({count}; {FEWEST_MOVES} are needed)"
-        for name, count in zip(names, counts, strict=True)
-        if 0 < count < FEWEST_MOVES
-    ]
+    few = [f"{name} ({count}; 5 are needed)" for name, count in zip(names, counts, strict=True) if 0 < count < 5]
     if not few:
         return ""
     return (
@@ -365,7 +337,8 @@ def _predicts_as_well(candidate: _Candidate, identified: _Candidate) -> bool:
     for columns in zip(residuals.T, others.T, both.T, strict=True):
         if np.count_nonzero(columns[2]) >= FEWEST_ROWS:
             sds = [learn(np.where(columns[2], column, np.nan), 1e-12).sd for column in columns[:2]]
-            if sds[0] > AS_WELL * sds[1]:
+            # above 1, as the process model holds where the input goes beyond the training
+            if sds[0] > 1.5 * sds[1]:
                 return False
     return True
 
@@ -397,10 +370,10 @@ def _prediction_obstacle(time_min: Array, inputs: Array) -> str:
     """Reason why rows could not be predicted."""
     follows = regular_intervals(time_min)
     regular = np.count_nonzero(follows)
-    if regular < USUAL_SHARE * follows.size:
+    if regular < 0.9 * follows.size:
         return f"do rows come one by one period? {regular} of {follows.size} spacings are within a tenth of the usual"
     known = int(np.count_nonzero(np.isfinite(inputs).all(axis=1)))
-    if FEWEST_ROWS <= known < USUAL_SHARE * len(inputs):
+    if FEWEST_ROWS <= known < 0.9 * len(inputs):
         return f"{'the input has a value' if inputs.shape[1] == 1 else 'all inputs have values'} in {known} of them"
     return "too often a value is missing in the rows before"
 

@@ -11,27 +11,18 @@ import msgspec
 import numpy as np
 
 from monitor_node.ingest.rows import TOLERANCE, MeasuredRow, regular_intervals
-from monitor_node.learn.references import FilterReference, Reference, RowFilter, RowPrediction
+from monitor_node.learn.references import COPY_ROWS, FilterReference, Reference, RowFilter, RowPrediction
 from monitor_node.learn.training_rows import RowArrays
 from reactorwatch.arrays import Array
 from reactorwatch.contract.messages_pb2 import ModelSnapshot, Parameter
 from reactorwatch.errors import InputError
-from reactorwatch.identification.black_box.filter import MEMORY, BlackBoxFilter, BlackBoxFilterMemory
-from reactorwatch.identification.black_box.fit import fit_black_box
-from reactorwatch.identification.black_box.model import BlackBoxModel
+from reactorwatch.identification.black_box_filter import MEMORY, BlackBoxFilter, BlackBoxFilterMemory
+from reactorwatch.identification.black_box_fit import fit_black_box
+from reactorwatch.identification.black_box_model import BlackBoxModel
 from reactorwatch.kalman.batch import GATE
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MINUTE_NS
 from reactorwatch.stored_state import Memory, copy_of
-
-SETTLING_ROWS = 50
-"""Rows at the means before a step response."""
-
-COPY_ROWS = 250
-"""Rows between two copies of the parameters."""
-
-UNCERTAIN = 0.2
-"""Standard deviation of a coefficient of the dynamics above which the training did not determine them."""
 
 UNFAMILIAR = {
     "black-box": "rows are not judged while inputs have values that the black box has not learned, and teach it"
@@ -81,9 +72,6 @@ class BlackBoxMemory(Memory, tag="black-box"):
 
 class BlackBoxReference(FilterReference):
     """Filter of a state map whose parameters are learned; see `references.Reference`.
-
-    Args:
-        memory: the fitted state map, and where its filter stands.
 
     Attributes:
         model: the fitted state map.
@@ -188,7 +176,7 @@ class BlackBoxReference(FilterReference):
     @property
     def weakness(self) -> str:
         """See `Reference`."""
-        if self.model.dynamics_sd <= UNCERTAIN:
+        if self.model.dynamics_sd <= 0.2:
             return ""
         return (
             "the training moved the plant too little to determine its dynamics: at new set points false alarms may be "
@@ -251,12 +239,12 @@ class BlackBoxReference(FilterReference):
         model, p = self.model, len(self._outputs)
         copy = BlackBoxFilter(model, copy_of(self._filter.memory))
         limits, residuals = [inf] * p, []
-        for row in [*[list(model.centres)] * SETTLING_ROWS, *values.tolist()]:
+        for row in [*[list(model.centres)] * 50, *values.tolist()]:
             predicted = copy.update(row[p:], row[:p], limits)
             residuals.append(
                 np.full(p, nan) if predicted is None else np.subtract(row[:p], predicted.prediction) / predicted.sd
             )
-        return np.array(residuals[SETTLING_ROWS:])
+        return np.array(residuals[50:])
 
     def restart(self) -> None:
         """See `Reference`."""

@@ -25,9 +25,6 @@ from reactorwatch.process.model import MODEL_CACHE_SIZE, ProcessModel
 from reactorwatch.records.record import MINUTE_NS
 from reactorwatch.stored_state import Memory, copy_of
 
-MOST_UNKNOWN = 1
-"""Rows in succession whose input may be unknown; after more, the filter restarts."""
-
 
 class ProcessMemory(Memory, tag="process"):
     """Memory of a `ProcessReference`.
@@ -70,11 +67,6 @@ class ProcessMemory(Memory, tag="process"):
 
 class ProcessReference(FilterReference):
     """Extended Kalman filter of a process model.
-
-    Args:
-        model: process model.
-        outputs: names of the monitored outputs, in order.
-        memory: noise and what was learned, and where the filter stands.
 
     Raises:
         InputError: the model lacks an output.
@@ -186,7 +178,7 @@ class ProcessReference(FilterReference):
         inputs, missing = row.inputs, row.interval.missing
         unknown = any(memory.guessed) + memory.held_rows + missing
         if all(map(isfinite, inputs)):
-            if unknown > MOST_UNKNOWN:
+            if unknown > 1:
                 self._filter.interrupt()
             elif unknown:
                 changes = self._possible_changes(time_min, inputs)
@@ -332,10 +324,6 @@ def input_reach(time_min: Array, inputs: Array) -> float:
     """Largest pulse of an input that lasts one row: distance from the nearer of the rows before and after.
 
     It is 0 if each move lasts for two rows at least. Then the input of a missing row was that of a neighbour.
-
-    Args:
-        time_min: times in minutes, shape (n,).
-        inputs: values of the input, shape (n,); NaN if missing.
     """
     moved, is_next = np.abs(np.diff(inputs)), missing_in_intervals(time_min) == 0
     nearer = np.where(is_next[:-1] & is_next[1:], np.minimum(moved[:-1], moved[1:]), 0.0)
@@ -354,15 +342,7 @@ def fit_training_noise(
     smallest_sd: list[float],
     uncertain: tuple[str, ...],
 ) -> NoiseFit:
-    """Fit the noise of a plant and its sensors to its training.
-
-    Args:
-        model: process model.
-        outputs: names of the monitored outputs.
-        rows: rows of the training.
-        smallest_sd: least standard deviation of each sensor.
-        uncertain: what the filter estimates beside the states of the model, see `kalman.filter_states`.
-    """
+    """Fit the noise of a plant and its sensors to its training."""
     columns, smallest = model_outputs(model, outputs, rows.outputs), [1e-6] * len(model.outputs)
     for i, sd in zip(output_indices(model, outputs), smallest_sd, strict=True):
         smallest[i] = sd

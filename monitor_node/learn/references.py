@@ -17,6 +17,9 @@ from reactorwatch.contract.messages_pb2 import ModelSnapshot
 from reactorwatch.kalman.ekf_step import NoiseLevels
 from reactorwatch.process.model import ProcessModel
 
+COPY_ROWS = 250
+"""Rows between two copies of a model that learns: the end of learning takes back at least so many rows."""
+
 
 class RowPrediction(NamedTuple):
     """One-step-ahead prediction of a row.
@@ -93,12 +96,7 @@ class Reference(ABC):
 
     @abstractmethod
     def update(self, row: MeasuredRow, accept: tuple[bool, ...]) -> RowPrediction:
-        """Predict a row, then update with it.
-
-        Args:
-            row: the row.
-            accept: one flag an output: it corrects the reference whatever its residual.
-        """
+        """Predict a row, then update with it; an accepted output corrects the reference whatever its residual."""
 
     @abstractmethod
     def restart(self) -> None:
@@ -135,22 +133,13 @@ class Reference(ABC):
         return None
 
     def snapshot(self, output: int, inputs: tuple[str, ...], outputs: tuple[str, ...]) -> ModelSnapshot | None:
-        """Snapshot of the model of an output; None if the reference has no model of its own for it.
-
-        Args:
-            output: index of the output among the monitored ones.
-            inputs: names of the inputs.
-            outputs: names of the monitored outputs.
-        """
+        """Snapshot of the model of an output; None if the reference has no model of its own for it."""
         return None
 
     def step_responses(self, rows: int) -> Array | None:
         """Response of each normalised residual to a lasting step of one unit of its output, shape (outputs, rows).
 
         NaN where there is no model; None with equations.
-
-        Args:
-            rows: number of rows from the onset on.
         """
         return None
 

@@ -1,7 +1,7 @@
 """Training of one plant, row by row, until there are rows enough to learn its baseline from.
 
-A training with too much disturbance is refused and starts again. After `MOST_REFUSALS` the next is used in full: a
-plant that never rests is monitored as well.
+A training with too much disturbance is refused and starts again. The third is used in full: a plant that never rests
+is monitored as well.
 """
 
 from collections.abc import Sequence
@@ -18,12 +18,6 @@ from reactorwatch.errors import UnfitRecordError
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MINUTE_NS
 from reactorwatch.stored_state import Memory
-
-MOST_REFUSALS = 2
-"""Refused trainings after which the next is used in full."""
-
-TIMES_FEWEST = 2
-"""Times the fewest rows of a training that a part of it needs to judge the rest: with fewer it is too rough."""
 
 
 class TrainingMemory(Memory):
@@ -42,11 +36,6 @@ class TrainingMemory(Memory):
 
 class Training:
     """The training of one plant.
-
-    Args:
-        config: settings of the monitor.
-        model: process model of the plant; None if there is none.
-        models: identified models, which start again with each training.
 
     Attributes:
         memory: the rows so far, and the refusals before.
@@ -73,12 +62,7 @@ class Training:
         self.memory.rows, self.memory.began_ns = self._no_rows, time_ns
 
     def refuse(self, reason: str, time_ns: int) -> str:
-        """Refuse the training, and start it again; returns a note.
-
-        Args:
-            reason: reason of the refusal.
-            time_ns: time of the first row of the next one.
-        """
+        """Refuse the training, and start it again; returns a note."""
         self.memory.refusals, self.refused = self.memory.refusals + 1, reason
         self.restart(time_ns)
         return f"the training starts again: {reason}"
@@ -94,11 +78,7 @@ class Training:
         self.memory.rows.keeps_all = True
 
     def is_enough(self, timed_out: Sequence[bool] = ()) -> bool:
-        """True if there are enough rows with a value of each output.
-
-        Args:
-            timed_out: one flag an output: its data timeout is active, so it is disregarded; empty: none is.
-        """
+        """True if there are enough rows with a value of each output, but for those whose data timeout is active."""
         counts = self.memory.rows.counts
         if timed_out:
             counts = list(compress(counts, map(not_, timed_out)))
@@ -110,12 +90,7 @@ class Training:
             self.memory.began_ns = time_ns
 
     def share(self, period_ns: float, rows_before: int = 0) -> float:
-        """Share of the training that is done, at most 1.
-
-        Args:
-            period_ns: sampling period; 0: not known.
-            rows_before: number of rows in other modes, which count as well.
-        """
+        """Share of the training that is done, at most 1; rows before it, in other modes, count as well."""
         if not period_ns:
             return 0.0
         rows, wanted = self.memory.rows, self._config.training_length.count_rows(period_ns / MINUTE_NS)
@@ -127,21 +102,14 @@ class Training:
         return self._models.adapt(row)
 
     def finish(self, *, last_chance: bool | None = None) -> TrainingResult:
-        """Learn from the rows.
-
-        Args:
-            last_chance: True to use the training even if it is disturbed; None: after some refusals.
-        """
+        """Learn from the rows, even if they are disturbed at the last chance: as given, or after some refusals."""
         rows, self.memory.rows = self.memory.rows, self._no_rows
-        is_last = self.memory.refusals >= MOST_REFUSALS if last_chance is None else last_chance
+        is_last = self.memory.refusals >= 2 if last_chance is None else last_chance
         self.trained_rows = len(rows.times)
         return learn_baseline(self._config, self._model, self._models, rows, last_chance=is_last)
 
     def finish_early(self, *, times: int = 1) -> TrainingResult:
         """Learn from the rows so far.
-
-        Args:
-            times: times the fewest rows that a training needs, for which this one must do.
 
         Raises:
             InputError: there are too few rows to learn from, or no output can be watched.

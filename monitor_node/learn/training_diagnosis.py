@@ -27,8 +27,7 @@ from monitor_node.learn.process_reference import fit_training_noise, model_outpu
 from monitor_node.learn.training_rows import RowArrays, TrainingRows, screen_baseline
 from reactorwatch.arrays import Array
 from reactorwatch.contract.messages_pb2 import Baseline
-from reactorwatch.diagnosis.extended import extended_model
-from reactorwatch.diagnosis.result import AMBIGUOUS, NOMINAL, Cause, Diagnosis
+from reactorwatch.diagnosis.estimates import extended_model
 from reactorwatch.diagnosis.whiteness import minus_log10_p
 from reactorwatch.errors import InputError
 from reactorwatch.kalman.batch import GATE, LONGEST_GAP_MIN, FilterRecord, FilterResult
@@ -48,6 +47,7 @@ from reactorwatch.process.extended_model import ExtendedModel, extended_model_of
 from reactorwatch.process.model import MODEL_CACHE_SIZE, ProcessModel
 from reactorwatch.process.profiles import FREE_NAME
 from reactorwatch.records.record import GAP_ROWS, MINUTE_NS, Record
+from reactorwatch.sentences.diagnosis import describe_training
 
 DIAGNOSED = "diagnosed"
 """`Baseline.what` of a change after a diagnosis of the training."""
@@ -150,13 +150,7 @@ def _shorten_gaps(time_min: Array) -> Array:
 
 
 def _diagnose(record: Record, model: ProcessModel, uncertain: Uncertain) -> tuple[str, str, ExtendedModel | None]:
-    """Verdict of the diagnosis, the reason, and the model with the causes that last; None: there are none.
-
-    Args:
-        record: the training.
-        model: equations of the plant.
-        uncertain: what its filter estimates beside the states, see `find_uncertain`.
-    """
+    """Verdict of the diagnosis, the reason, and the model with the causes that last; None: there are none."""
     from reactorwatch.diagnosis.diagnose import diagnose  # a quarter of a second, which no other row needs
 
     try:
@@ -167,9 +161,9 @@ def _diagnose(record: Record, model: ProcessModel, uncertain: Uncertain) -> tupl
         return FAILED, f"not diagnosed: {error}", None
     lasting = [cause for cause in found.causes if cause.profile != FREE_NAME]
     if not lasting:
-        return found.verdict, _reason(found), None
+        return found.verdict, describe_training(found), None
     extended = extended_model(model, effects_of(model), lasting, record.zero_ns)
-    return found.verdict, _reason(found), parse_extended_model(_json(extended))
+    return found.verdict, describe_training(found), parse_extended_model(_json(extended))
 
 
 def equations_text(model: ProcessModel | None) -> str:
@@ -197,24 +191,6 @@ def read_equations(text: str) -> ProcessModel:
         raise InputError(f"the model of the baseline {error}") from error
 
 
-def _reason(found: Diagnosis) -> str:
-    if found.verdict == NOMINAL:
-        return "the training agrees with the equations"
-    if not found.causes:
-        return f"the training deviates from the equations ({found.location}), and no cause of the catalogue explains it"
-    text = f"the training deviates from the equations by {' and '.join(map(_text, found.causes))}"
-    others = [" and ".join(map(_text, item.explanation)) for item in found.alternatives]
-    return f"{text}; its rows do not rule out {', or '.join(others)}" if found.verdict == AMBIGUOUS else text
-
-
-def _text(cause: Cause) -> str:
-    size = cause.parameters["size"]
-    if cause.profile == FREE_NAME:
-        return f"{cause.label} ({cause.cause}) in the course of a curve, which predicts no other rows"
-    unit = "" if size.unit == "1" else f" {size.unit}"
-    return f"{cause.label} ({cause.cause}, {cause.profile}) of {size.value:+.3g}{unit}"
-
-
 def _json(extended: dict[str, Any]) -> str:
     return msgspec.json.encode(extended).decode()
 
@@ -225,30 +201,12 @@ LEAST_ROWS = 100
 LEAST_GAIN = 8.0
 """Gain of log likelihood beyond which something is taken for a part of the plant."""
 
-COLOURED = 3.0
-"""Minus the decimal logarithm of the p-value beyond which innovations are not white, and disturbances are sought."""
-
-MOST_DISTURBANCES = 2
-
 MOVE_ROWS = 60
 """Number of rows after a move of an input that are predicted."""
 
-SMALLEST_SD = 1e-6
-"""Least standard deviation of a sensor."""
-
-UNCERTAIN = 1.25
-"""Ratio of standard deviations after a move, uncertain to certain constants, beyond which the training leaves open how
-the plant follows."""
-
 
 def find_uncertain(model: ProcessModel, outputs: tuple[str, ...], rows: RowArrays) -> Uncertain:
-    """Find additional states that a filter of the model needs; empty: none.
-
-    Args:
-        model: equations of the plant.
-        outputs: names of the outputs.
-        rows: rows of the training.
-    """
+    """Find additional states that a filter of the model needs; empty: none."""
     if np.min(np.count_nonzero(np.isfinite(rows.outputs), axis=0), initial=LEAST_ROWS) < LEAST_ROWS:
         return Uncertain()
     fitter = _NoiseFitter(model, outputs, rows)
@@ -260,7 +218,7 @@ def find_uncertain(model: ProcessModel, outputs: tuple[str, ...], rows: RowArray
     best = fitter.fit(constants)
     candidates = [f"{WANDER} {item.name}" for item in model.states if item.name not in model.at_rest]
     candidates += [f"{NOISE} {name}" for name in outputs]
-    while len(best.uncertain) < len(constants) + MOST_DISTURBANCES and fitter.are_coloured(best):
+    while len(best.uncertain) < len(constants) + 2 and fitter.are_coloured(best):
         fits = (fitter.fit((*best.uncertain, item)) for item in candidates if item not in best.uncertain)
         found = min(fits, key=lambda item: item.noise.loss)
         if found.noise.loss > best.noise.loss - LEAST_GAIN:
@@ -270,7 +228,8 @@ def find_uncertain(model: ProcessModel, outputs: tuple[str, ...], rows: RowArray
         learned = (best.noise.parameters[name] for name in learned_parameters(best.uncertain))
         return Uncertain(best.uncertain, tuple(learned))
     certain, uncertain = fitter.sds_after_moves(plain), fitter.sds_after_moves(best)
-    return Uncertain(constants) if np.any(uncertain > UNCERTAIN * certain) else Uncertain()
+    # the training leaves open how the plant follows
+    return Uncertain(constants) if np.any(uncertain > 1.25 * certain) else Uncertain()
 
 
 def describe_uncertain(uncertain: Sequence[str]) -> str:
@@ -302,7 +261,7 @@ class _NoiseFitter:
 
     def fit(self, uncertain: tuple[str, ...]) -> _Fit:
         """Fit the noise of the model with uncertain parts."""
-        model, smallest = self._model, [SMALLEST_SD] * len(self._outputs)
+        model, smallest = self._model, [1e-6] * len(self._outputs)
         found = fit_training_noise(model, self._outputs, self._rows, smallest, uncertain)
         return _Fit(uncertain, found, Filter(widen_model(model, uncertain), found.levels, found.parameters))
 
@@ -324,7 +283,7 @@ class _NoiseFitter:
     def are_coloured(self, item: _Fit) -> bool:
         """True if the innovations are not white."""
         w = np.where(item.noise.w != 0.0, item.noise.w, nan)
-        return bool(np.max(minus_log10_p(w, self._rows.inputs[len(self._rows.inputs) - len(w) :])) >= COLOURED)
+        return bool(np.max(minus_log10_p(w, self._rows.inputs[len(self._rows.inputs) - len(w) :])) >= 3.0)
 
     def sds_after_moves(self, item: _Fit) -> Array:
         """Standard deviations of predictions after a move of each input up and down, shape (moves, rows, n_y)."""

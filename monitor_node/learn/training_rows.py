@@ -68,13 +68,7 @@ class TrainingRows(Memory):
     keeps_all: bool = False
 
     def add(self, time_ns: int, inputs: Sequence[float], values: Sequence[float]) -> None:
-        """Add a row.
-
-        Args:
-            time_ns: time of the row.
-            inputs: one value an input; NaN if missing.
-            values: outputs; NaN if missing.
-        """
+        """Add a row."""
         if self.times and time_ns <= self.times[-1]:  # the publisher was restarted: so is the record
             del self.times[:], self.numbers[:]
             self.counts, self.dropped = [0] * len(values), 0
@@ -111,23 +105,13 @@ class TrainingRows(Memory):
 
 Mask = NDArray[np.bool_]
 
-BLOCKS = 25
 SMALLEST_BLOCK = 20
 """Rows. In a training shorter than four such blocks only outliers are left out."""
-
-LARGEST_DEVIATION = 5.0
-"""Robust standard deviations by which a block may differ from the median block."""
 
 OUTLIER = 6.0
 """Robust standard deviations beyond which a single value is left out."""
 
-MOST_LEFT_OUT = 1.0 / 3.0
-
-USUAL_SHARE = 0.95
-"""Least share of values that are no outliers."""
-
 _TO_SD = 1.4826  # of the median absolute deviation, for normal values
-_USUAL_TO_SD = 1.0 / 1.96  # of the absolute deviation that 95 % of normal values are within
 
 
 class Screening(NamedTuple):
@@ -156,7 +140,7 @@ class Screening(NamedTuple):
     def refused(self) -> bool:
         """True if too much is left out to trust the rest."""
         left_out = sum(last - first + 1 for first, last in self.disturbed_intervals)
-        return left_out > MOST_LEFT_OUT * self.usable.size
+        return left_out > 1.0 / 3.0 * self.usable.size
 
 
 def screen_baseline(z: Array, smallest_sd: float = 0.0) -> Screening:
@@ -170,7 +154,7 @@ def screen_baseline(z: Array, smallest_sd: float = 0.0) -> Screening:
     if not present.any():
         return Screening(present, [], [], none := np.zeros(z.size, np.bool_), none)
     centre, sd = _centre_and_sd(z[present], smallest_sd)
-    size = max(SMALLEST_BLOCK, z.size // BLOCKS)
+    size = max(SMALLEST_BLOCK, z.size // 25)
     starts = np.arange(0, z.size - size + 1, size)
     disturbed = np.zeros(z.size, dtype=np.bool_)
     if starts.size >= 4 and sd > 0:
@@ -190,8 +174,9 @@ def screen_baseline(z: Array, smallest_sd: float = 0.0) -> Screening:
 def _centre_and_sd(z: Array, smallest_sd: float) -> tuple[float, float]:
     """Median, and robust standard deviation of the values."""
     centre = float(np.median(z))
-    half, usual = np.quantile(np.abs(z - centre), (0.5, USUAL_SHARE)).tolist()
-    return centre, max(_TO_SD * half, _USUAL_TO_SD * usual, smallest_sd)
+    half, usual = np.quantile(np.abs(z - centre), (0.5, 0.95)).tolist()
+    # 95 % of normal values are within 1.96 standard deviations
+    return centre, max(_TO_SD * half, 1.0 / 1.96 * usual, smallest_sd)
 
 
 def _outlying_blocks(blocks: list[Array], centre: float, sd: float, smallest_sd: float) -> list[int]:
@@ -214,7 +199,7 @@ def _is_far(values: Array, smallest_sd: float) -> Mask:
     A disturbance of two fifths of the blocks widens every measure of all blocks, but makes only two neighbours differ.
     """
     sd = _TO_SD * float(np.median(np.abs(np.diff(values)))) / np.sqrt(2.0)
-    return np.asarray(np.abs(values - np.median(values)) > LARGEST_DEVIATION * max(sd, smallest_sd))
+    return np.asarray(np.abs(values - np.median(values)) > 5.0 * max(sd, smallest_sd))
 
 
 def _intervals(disturbed: Mask) -> list[tuple[int, int]]:
@@ -224,16 +209,6 @@ def _intervals(disturbed: Mask) -> list[tuple[int, int]]:
 
 ROWS_AFTER = 5
 """Rows after a move in which the residual is compared."""
-
-MOST_MOVED = 0.1
-"""Share of the rows that are compared with the others: those after the largest moves; more if moves are equal."""
-
-UNLIKELY = 0.003
-"""Probability of so different residuals by chance below which they depend on the moves."""
-
-FEWEST = 5
-LARGEST = 10.0
-_QUANTILE, _NORMAL_QUANTILE = 0.97, 2.17
 
 
 class AfterMoves(NamedTuple):
@@ -280,16 +255,16 @@ def compare_after_moves(e: Array, inputs: Array) -> AfterMoves:
     for column in np.abs(e.T):
         known = ~np.isnan(column)
         after, others = column[known & moved], column[known & ~moved]
-        if min(len(after), len(others)) < FEWEST:
+        if min(len(after), len(others)) < 5:
             continue
-        size = float(np.quantile(np.minimum(after, LARGEST), _QUANTILE)) / _NORMAL_QUANTILE
-        if size > found.size and probability_of_larger(after, others) < UNLIKELY / e.shape[1]:
+        size = float(np.quantile(np.minimum(after, 10.0), 0.97)) / 2.17  # that of a standard normal variable
+        if size > found.size and probability_of_larger(after, others) < 0.003 / e.shape[1]:
             found = AfterMoves(size, share)
     return found
 
 
 def after_largest_moves(inputs: Array) -> NDArray[np.bool_]:
-    """Flags of the rows after the largest moves of an input, about `MOST_MOVED` of them, shape (rows,)."""
+    """Flags of the rows after the largest moves of an input, about 0.1 of them, shape (rows,)."""
     known = [column[np.isfinite(column)] for column in inputs.T]
     spreads = np.array([np.std(column) if column.size else 0.0 for column in known])
     used = inputs[:, spreads > 0.0] / spreads[spreads > 0.0]
@@ -298,7 +273,7 @@ def after_largest_moves(inputs: Array) -> NDArray[np.bool_]:
     moves = np.nan_to_num(np.abs(np.diff(used, axis=0))).max(axis=1)
     before = np.concatenate([np.zeros(ROWS_AFTER + 1), moves])[: len(inputs) + ROWS_AFTER - 1]
     recent = np.lib.stride_tricks.sliding_window_view(before, ROWS_AFTER).max(axis=1)
-    limit = np.quantile(recent, 1.0 - MOST_MOVED)
+    limit = np.quantile(recent, 0.9)
     moved = recent > limit
     return np.asarray(moved if moved.any() else (recent == limit) & (recent > 0.0))
 

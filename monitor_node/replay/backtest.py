@@ -1,11 +1,12 @@
 """Back-test: run the monitor's core over a recording at full speed, after checks of the record that it learns from."""
 
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import partial
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
+from msgspec.structs import replace
 
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
@@ -18,12 +19,16 @@ from monitor_node.watch.pipeline import PipelineMemory
 from monitor_node.watched_process import load_process
 from reactorwatch.contract import keys
 from reactorwatch.contract.alarm_states import Event
-from reactorwatch.contract.alarm_text import set_suspects
 from reactorwatch.contract.codec import Encoded, Publication
-from reactorwatch.contract.messages_pb2 import Alarm, Baseline, Incident, Promise
+from reactorwatch.contract.messages_pb2 import Alarm, Baseline, Incident
+from reactorwatch.contract.messages_pb2 import Promise as PromiseMessage
 from reactorwatch.errors import UnfitRecordError
+from reactorwatch.limits import parse_json
 from reactorwatch.process.model import ProcessModel
-from reactorwatch.records.record import Record
+from reactorwatch.records.record import Record, format_utc, to_minutes
+from reactorwatch.results.alarms import raised_alarms
+from reactorwatch.results.backtest import Backtest, ChangedModel, LeftOut, NoiseLevels, WatchedSignals
+from reactorwatch.results.promise import Power, Promise, state_promise, three_digits
 
 RAISED, CLEARED = Event.RAISED.value, Event.CLEARED.value
 
@@ -105,78 +110,18 @@ class TrainedPlant(NamedTuple):
     notes: list[str]
 
 
-@dataclass
-class Backtest:
-    """Result of a back-test.
+class RecordFacts(NamedTuple):
+    """Facts about a record that its messages do not have.
 
     Attributes:
-        inputs: names of the inputs.
-        outputs: names of the outputs.
-        rows: number of rows.
-        first_ns: time of the first row; 0 without rows.
-        last_ns: time of the last row; 0 without rows.
-        span_ns: time span of the rows, summed over the runs of the plant.
-        runs: number of runs of the plant: one more than restarts of the plant or its clock.
-        watching_since_ns: time of the first evaluated row; None if the record is shorter than the training.
-        expected_false_alarms: see `PlantPipeline.expected_false_alarms`.
-        alarm_messages: every change of an alarm, in order.
-        refused: number of rejected messages by reason.
-        notes: notes on the training.
-        left_out: signals that are not monitored, with the reason.
-        reference: kind of the reference, `equations` or `arx`; None if no row was evaluated.
-        noise_levels: standard deviations of the equations' filter: of each sensor in its unit (`sensors`), of each
-            state in its unit per square root of a minute (`states`); None with another reference.
-        training_rows: number of rows of the training; 0 if no row was evaluated.
-        promise: promise of false alarms for the evaluated rows; None if no row was evaluated.
-        not_watched: reason why no row could be judged; empty if one was.
-        baseline: change of the model after the diagnosis of the training; None: rows were evaluated by the equations as
-            given.
+        file: name of the record.
+        clock_shift_ns: shift from the times of its messages to clock time; None: unknown.
+        still: inputs that never move, with the reason why they explain nothing.
     """
 
-    inputs: tuple[str, ...]
-    outputs: tuple[str, ...]
-    rows: int
-    first_ns: int
-    last_ns: int
-    span_ns: int
-    runs: int
-    watching_since_ns: int | None
-    expected_false_alarms: float
-    alarm_messages: list[Alarm]
-    incident_messages: list[Incident]
-    refused: dict[str, int]
-    notes: list[str]
-    left_out: dict[str, str]
-    reference: str | None = None
-    noise_levels: dict[str, dict[str, float]] | None = None
-    baseline: Baseline | None = None
-    training_rows: int = 0
-    promise: Promise | None = None
-    not_watched: str = ""
-
-    @property
-    def raised_alarms(self) -> list[tuple[Alarm, int | None]]:
-        """Each alarm as raised, with its newest suspects, and the time when it was cleared (None: it is active)."""
-        alarms: list[tuple[Alarm, int | None]] = []
-        last: dict[str, int] = {}
-        newest = {message.number: message.suspects for message in self.incident_messages}
-        for message in self.alarm_messages:
-            if message.event == RAISED:
-                last[message.alarm] = len(alarms)
-                alarm = Alarm()
-                alarm.CopyFrom(message)
-                alarms.append((alarm, None))
-            elif message.alarm in last:
-                alarm, cleared_ns = alarms[last[message.alarm]]
-                if message.raised_ns == alarm.raised_ns and message.suspects:
-                    set_suspects(alarm, message.suspects)
-                if cleared_ns is None and (message.cleared_ns or message.event == CLEARED):
-                    cleared_ns = message.cleared_ns
-                alarms[last[message.alarm]] = (alarm, cleared_ns)
-        for alarm, cleared_ns in alarms:
-            if cleared_ns is None and not alarm.names_cause:
-                set_suspects(alarm, newest.get(alarm.incident, ()))
-        return alarms
+    file: str = "record"
+    clock_shift_ns: int | None = None
+    still: Mapping[str, str] = MappingProxyType({})
 
 
 def train(
@@ -198,26 +143,29 @@ def train(
 def run(
     messages: Iterable[Encoded],
     config: MonitorConfig,
-    zero_ns: int = 0,
+    zero_ns: int | None = 0,
     model: ProcessModel | None = None,
     trained: TrainedPlant | None = None,
     log: RowLog | None = None,
+    facts: RecordFacts | None = None,
 ) -> Backtest:
     """Run the monitor over messages in the order of receipt.
 
     Args:
         messages: messages; all but samples of `config.plant` are ignored.
         config: settings of the monitor.
-        zero_ns: zero of the model's minutes, if its file does not have it.
+        zero_ns: time from which minutes are counted, those of the model, too, if its file does not have it; None: that
+            of the first sample.
         model: model with the equations, with minutes from 1970-01-01 UTC; None: the one that the settings name.
         trained: result of a training with the same settings and model, by which all rows are judged; None: the rows
             begin with a training.
         log: log to which the rows are added; None: they are not logged.
+        facts: facts about the record; None: its name and clock time are unknown.
 
     Raises:
         InputError: the settings are inconsistent, or the model's file is unusable.
     """
-    monitor = _make_monitor(config, zero_ns, model)
+    monitor, facts = _make_monitor(config, zero_ns or 0, model), facts or RecordFacts()
     if trained is not None:
         monitor.pipeline.resume(PipelineMemory.from_bytes(trained.memory), 0)
         monitor.pipeline.start_run()
@@ -230,29 +178,73 @@ def run(
             first_ns = monitor.memory.first_ns
         alarms += (item.message for item in publications if isinstance(item.message, Alarm))
         incidents += (item.message for item in publications if isinstance(item.message, Incident))
-    reference = monitor.pipeline.evaluation.reference
+    first_ns = first_ns or 0
+    zero_ns = first_ns if zero_ns is None else zero_ns
+    clock_zero_ns = None if facts.clock_shift_ns is None else zero_ns + facts.clock_shift_ns
+    obstacle, since_ns, elsewhere = _describe_obstacle(monitor), monitor.memory.watching_since_ns, trained is not None
+    expected, message = monitor.pipeline.baselines.expected_false_alarms, monitor.promise
+    promise, power = _promise_of_rows(message, expected)
     return Backtest(
-        inputs=monitor.config.inputs,
-        outputs=monitor.config.outputs,
-        rows=monitor.rows,
-        first_ns=first_ns or 0,
-        last_ns=monitor.memory.last_ns or 0,
-        span_ns=monitor.span_ns,
+        file=facts.file,
+        watched=not obstacle,
+        why=obstacle or None,
+        samples=monitor.rows,
+        zero=None if clock_zero_ns is None else format_utc(clock_zero_ns),
+        span_min=to_minutes(monitor.span_ns),
         runs=1 + monitor.intake.aligner.memory.counts.restarts,
-        watching_since_ns=monitor.memory.watching_since_ns,
-        expected_false_alarms=monitor.pipeline.baselines.expected_false_alarms,
+        trained_until_min=0.0 if elsewhere else None if since_ns is None else to_minutes(since_ns, zero_ns),
+        expected_false_alarms=three_digits(expected),
+        promise=promise,
+        power=power,
+        signals=_watched_signals(monitor.config, {**facts.still, **monitor.excluded_signals}),
+        reference=monitor.pipeline.reference or monitor.pipeline.baselines.modes.reference or None,
+        noise_levels=_noise_levels(monitor),
+        baseline=_changed_model(monitor.baseline, zero_ns),
+        alarms=raised_alarms(alarms, incidents, zero_ns),
+        training_rows=monitor.pipeline.training.trained_rows if trained is None else trained.rows,
+        can_keep_per_30_days=None if message is None else message.can_keep_per_30_days,
+        trained_elsewhere=elsewhere,
+        notes=[*(trained.notes if trained is not None else ()), *monitor.notes],
+        refused=dict(monitor.intake.rejects.by_reason),
+        zero_ns=zero_ns,
+        clock_zero_ns=clock_zero_ns,
+        first_ns=first_ns,
+        last_ns=monitor.memory.last_ns or 0,
+        watching_since_ns=since_ns,
         alarm_messages=alarms,
         incident_messages=incidents,
-        refused=dict(monitor.intake.rejects.by_reason),
-        notes=[*(trained.notes if trained is not None else ()), *monitor.notes],
-        left_out=monitor.excluded_signals,
-        reference=monitor.pipeline.reference or monitor.pipeline.baselines.modes.reference or None,
-        noise_levels=None if reference is None else reference.noise_levels,
-        baseline=monitor.baseline,
-        training_rows=monitor.pipeline.training.trained_rows if trained is None else trained.rows,
-        promise=monitor.promise,
-        not_watched=_describe_obstacle(monitor),
     )
+
+
+def _promise_of_rows(message: PromiseMessage | None, expected: float) -> tuple[Promise | None, list[Power]]:
+    """Promise for the rows that were judged, and power.
+
+    Args:
+        message: the promise at the end of the record; None: no row was judged.
+        expected: false alarms promised in these rows.
+    """
+    promise, power = state_promise(message)
+    if promise is None or message is None:
+        return None, power
+    upper = expected * message.expected_90 / message.expected
+    return replace(promise, expected=three_digits(expected), expected_90=three_digits(upper)), power
+
+
+def _watched_signals(config: MonitorConfig, left_out: Mapping[str, str]) -> WatchedSignals:
+    inputs, outputs = ([name for name in names if name not in left_out] for names in (config.inputs, config.outputs))
+    return WatchedSignals(inputs, outputs, [LeftOut(name, why) for name, why in left_out.items()])
+
+
+def _noise_levels(monitor: Monitor) -> NoiseLevels | None:
+    reference = monitor.pipeline.evaluation.reference
+    levels = None if reference is None else reference.noise_levels
+    return None if levels is None else NoiseLevels(**levels)
+
+
+def _changed_model(change: Baseline | None, zero_ns: int) -> ChangedModel | None:
+    if change is None:
+        return None
+    return ChangedModel(change.what, to_minutes(change.time_ns, zero_ns), change.why, parse_json(change.model))
 
 
 def _publications(monitor: Monitor, messages: Iterable[Encoded]) -> Iterator[list[Publication]]:
@@ -322,21 +314,22 @@ def check_training_record(record: Record, config: MonitorConfig, model: ProcessM
     }
 
 
-def check_watched(name: object, result: Backtest) -> None:
+def check_watched(name: object, outputs: Sequence[str], result: Backtest) -> None:
     """Check that there was something to watch.
 
     Args:
         name: name of the record.
+        outputs: names of its outputs.
         result: result of its back-test.
 
     Raises:
         InputError: it has no usable row, or no output that can be watched.
     """
-    if not result.rows:
+    if not result.samples:
         why = ", ".join(f"{count} {reason}" for reason, count in sorted(result.refused.items()))
         raise UnfitRecordError(f"{name}: holds no sample that can be used{f'; refused: {why}' if why else ''}")
-    if set(result.outputs) <= result.left_out.keys():
-        reasons = "; ".join(f"{output}: {result.left_out[output]}" for output in result.outputs)
+    if not result.signals.outputs:
+        reasons = "; ".join(f"{output}: {result.exclusions[output]}" for output in outputs)
         raise UnfitRecordError(f"{name}: there is no output to watch ({reasons})")
 
 

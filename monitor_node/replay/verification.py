@@ -20,7 +20,7 @@ from itertools import islice
 from typing import Any
 
 from monitor_node.alarms.annunciator import Action
-from monitor_node.checks.silence import SilenceCheck
+from monitor_node.checks.signal_checks import SilenceCheck
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from monitor_node.replay.message_diff import MessageDiff

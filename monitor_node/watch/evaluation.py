@@ -13,11 +13,10 @@ from monitor_node.alarms.annunciator import Annunciator
 from monitor_node.causes.stage import Suspicion, SuspicionMemory, has_causes
 from monitor_node.charts.chart_design import count_chance_alarms
 from monitor_node.charts.charts import ChartsMemory, ChartWatch
-from monitor_node.charts.drift import DriftWatch
-from monitor_node.charts.shift import NAME as SHIFT
-from monitor_node.charts.shift import ShiftWatch
+from monitor_node.charts.shift_and_drift import NAME as SHIFT
+from monitor_node.charts.shift_and_drift import DriftWatch, ShiftWatch
 from monitor_node.checks.base import CheckTraining
-from monitor_node.checks.stage import SignalChecks
+from monitor_node.checks.signal_checks import SignalChecks
 from monitor_node.config import MonitorConfig
 from monitor_node.ingest.rows import SamplingPeriod
 from monitor_node.learn.arx import ArxMemory, ArxPredictor, ArxReference
@@ -26,11 +25,11 @@ from monitor_node.learn.baseline import TrainingResult
 from monitor_node.learn.black_box_reference import BlackBoxMemory
 from monitor_node.learn.process_reference import ProcessMemory
 from monitor_node.learn.references import Reference
-from monitor_node.learn.signal_range import possible_ranges, stated_ranges
 from monitor_node.learn.training_rows import TrainingRows
 from monitor_node.watch.power import Watch
 from monitor_node.watch.promise import PlantPromise, PromiseStage
 from monitor_node.watch.row_step import OrdinaryRows
+from monitor_node.watched_process import possible_ranges, stated_ranges
 from reactorwatch.arrays import Array
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Publication
@@ -88,35 +87,7 @@ class EvaluationMemory(Memory, kw_only=True):
 
 
 class Evaluation:
-    """Stages of the evaluation of one plant's rows.
-
-    Args:
-        config: settings of the monitor.
-        board: alarms of the plant; those of the stages are declared here.
-        models: identified models.
-        model: process model of the plant; None if there is none.
-        is_process: True if the plant is known to be the model's, whatever judges it.
-        promises: stage of the promise of false alarms.
-
-    Attributes:
-        memory: memory of the stages; `collect_memory` completes it.
-        models: identified models.
-        ordinary: the compiled step, with the numbers of the stages.
-        signals: signal checks.
-        charts: charts.
-        drift: drift charts.
-        shift: tests of lasting steps.
-        promises: stage of the promise of false alarms.
-        whiteners: prewhitening filters, one an output.
-        whitener_numbers: numbers of these filters, shape (outputs,).
-        whitened_sds: standard deviation of each prewhitened residual, in those of the residual.
-        reference: the reference; None if rows are not evaluated.
-        suspicion: search for causes; None if there is none.
-        evaluated: for each output, True if it is evaluated.
-        is_process: True if the plant is the model's.
-        is_ordinary: True if the compiled step may take the next row, see `row_step`.
-        notes: notes to log, oldest first; the caller empties the list.
-    """
+    """Stages of the evaluation of one plant's rows."""
 
     def __init__(
         self,
@@ -201,13 +172,7 @@ class Evaluation:
     # --- start and stop --------------------------------------------------------------------------------------
 
     def start(self, trained: TrainingResult, period_ns: float, *, again: bool) -> None:
-        """Start to evaluate rows.
-
-        Args:
-            trained: result of the training.
-            period_ns: sampling period.
-            again: True if rows are evaluated already, by another model; the drift of the identified models goes on.
-        """
+        """Start to evaluate rows, or `again` by another model: the drift of the identified models then goes on."""
         self._leave_out(trained.left_out)
         unmade = self.charts.design.choose(self.evaluated, trained.e, trained.values)
         self.shift.is_active = trained.responses is not None and not self._config.has_values_only
@@ -236,14 +201,7 @@ class Evaluation:
     def check_training(
         self, trained: TrainingResult, model: ProcessModel | None, period_ns: float, units: Sequence[str]
     ) -> None:
-        """Judge the training by itself, and state the power of the watch that has started with it.
-
-        Args:
-            trained: result of the training.
-            model: equations that judge; None: none do.
-            period_ns: sampling period.
-            units: units of the outputs.
-        """
+        """Judge the training by itself, and state the power of the watch that has started with it."""
         watch: Watch | None = None
         if self.promises.states_power:
             watch = Watch(
@@ -353,10 +311,6 @@ class Evaluation:
     def _share_budget(self, period_min: float, checks: list[Check]) -> float:
         """In-control run length of each alarm, in rows.
 
-        Args:
-            period_min: sampling period.
-            checks: checks of the training; one is added where less is promised or tested than usual.
-
         Raises:
             InputError: the charts cannot keep the rate that the settings ask for.
         """
@@ -422,10 +376,6 @@ class Evaluation:
 
 def check_promise(config: MonitorConfig, period_min: float) -> None:
     """Check that charts can keep the promised number of false alarms, with every output monitored.
-
-    Args:
-        config: settings of the monitor.
-        period_min: sampling period in minutes.
 
     Raises:
         InputError: charts cannot keep the promise.

@@ -12,12 +12,9 @@ from math import isfinite, nan
 import msgspec
 
 from monitor_node.config import MonitorConfig
-from monitor_node.learn.signal_range import SignalRange
+from monitor_node.watched_process import SignalRange
 from reactorwatch.records.record import MINUTE_NS
 from reactorwatch.spc.charts.base import format_quantity
-
-AT_BOUND = 1e-6
-"""Share of an input's range within which it is at its bound."""
 
 RAMP_MIN = 1.0
 """Longest pause within one move of a set point that is moved in steps."""
@@ -45,11 +42,6 @@ class CarriedState(msgspec.Struct, forbid_unknown_fields=True):
 
 class Operation:
     """Follows the operation of one plant.
-
-    Args:
-        config: settings of the monitor.
-        bounds: bounds of each input.
-        units: units by signal.
 
     Attributes:
         memory: states of modes and set points, by signal.
@@ -119,7 +111,7 @@ class Operation:
 
 def _describe_saturation(name: str, bounds: SignalRange, value: float) -> str:
     span = bounds.upper - bounds.lower
-    margin = AT_BOUND * span if isfinite(span) else 0.0
+    margin = 1e-6 * span if isfinite(span) else 0.0
     for side, bound in (("lower", bounds.lower), ("upper", bounds.upper)):
         if abs(value - bound) <= margin:
             return f"{name} is at its {side} bound, {format_quantity(bound, bounds.unit, '.6g')}"

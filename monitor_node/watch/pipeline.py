@@ -18,25 +18,23 @@ from monitor_node.alarms.alarms import AlarmChange
 from monitor_node.alarms.annunciator import Annunciator
 from monitor_node.causes.stage import Suspicion
 from monitor_node.checks.base import CheckRow
-from monitor_node.config import DEFAULT, WITHOUT_EQUATIONS, MonitorConfig
+from monitor_node.config import MonitorConfig
 from monitor_node.health import NODE, Failures
 from monitor_node.ingest.rows import MeasuredRow, Row, SamplingPeriod
 from monitor_node.learn.arx import ArxReference
 from monitor_node.learn.baseline import NO_VALUE, TrainingResult
-from monitor_node.learn.model_update import is_command
-from monitor_node.learn.signal_range import input_bounds
 from monitor_node.learn.training import TrainingMemory
 from monitor_node.learn.training_diagnosis import DiagnosisJob, Finding
 from monitor_node.learn.training_rows import TrainingRows
-from monitor_node.watch.baselines import Baselines, ModesMemory
+from monitor_node.watch.baselines import Baselines, ModesMemory, is_command
 from monitor_node.watch.evaluation import Evaluation, EvaluationMemory, check_promise
 from monitor_node.watch.operation import CarriedState, Operation
 from monitor_node.watch.promise import PromiseStage
 from monitor_node.watch.row_step import EVENT, VIOLATING
+from monitor_node.watched_process import input_bounds, judging_equations
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Publication
 from reactorwatch.contract.messages_pb2 import Alarm, Baseline, Estimate
-from reactorwatch.errors import InputError
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MINUTE_NS
 from reactorwatch.spc.prewhitening import innovations
@@ -72,16 +70,6 @@ class PipelineMemory(Memory):
 class PlantPipeline:
     """Pipeline of one plant.
 
-    Args:
-        config: settings of the monitor.
-        board: alarms of the plant.
-        points: True to publish estimates, chart points and models.
-        model: see `Monitor`.
-        failures: counter of errors in the search for causes; None: a new one.
-        changes: changes of the baseline to come.
-        diagnose: diagnoses the training before the first row is evaluated; None: the caller takes `diagnosis_job`.
-        promises: stage of the promise of false alarms; None: one that checks and states nothing more.
-
     Raises:
         InputError: the settings ask for a process model that does not fit the plant's signals.
 
@@ -112,7 +100,7 @@ class PlantPipeline:
         self._failures = Failures() if failures is None else failures
         self._points = points
         self._inputs = len(config.inputs)
-        self.model = _model(config, model)
+        self.model = judging_equations(config, model)
         units = {**config.units, **(self.model.units if self.model is not None else {})}
         self.operation = Operation(config, input_bounds(config, self.model), units)
         board.describe_operation = self.operation.describe
@@ -130,14 +118,9 @@ class PlantPipeline:
             is_process=model is not None or config.reference == "equations",
             promises=promises or PromiseStage(config, board, self._failures, points=points),
         )
+        changes = deque() if changes is None else changes
         self.baselines = Baselines(
-            config,
-            self.model,
-            self.evaluation,
-            self.operation,
-            self._failures,
-            deque() if changes is None else changes,
-            diagnose,
+            config, self.model, self.evaluation, self.operation, self._failures, changes, diagnose
         )
         self.training = self.baselines.training
         self._noted: set[str] = set()
@@ -163,21 +146,14 @@ class PlantPipeline:
     def resume(self, memory: PipelineMemory, now_ns: int) -> None:
         """Resume bit-identically from a memory of the same settings; the alarms are restored before.
 
-        Args:
-            memory: the memory, which is then the one that runs.
-            now_ns: present time, from which the data timeout counts.
-
         Raises:
             ValueError: the memory is damaged.
         """
         update, baselines = self.baselines.update, self.baselines
         if set(memory.operation) != set(self.operation.memory):
             raise ValueError(f"the state must be of {sorted(self.operation.memory)}, got {sorted(memory.operation)}")
-        self._sampling, self.operation.memory, self.training.memory = (
-            memory.sampling,
-            memory.operation,
-            memory.training,
-        )
+        self._sampling = memory.sampling
+        self.operation.memory, self.training.memory = memory.operation, memory.training
         baselines.modes, baselines.kept, update.baseline = memory.modes, memory.kept, memory.change
         update.changes.extend(memory.commands)
         update.rows = memory.undiagnosed if self._config.diagnose_training else None
@@ -206,13 +182,7 @@ class PlantPipeline:
     # --- rows ------------------------------------------------------------------------------------------------
 
     def update(self, row: Row, units: list[str], publications: list[Publication]) -> None:
-        """Process a row.
-
-        Args:
-            row: values, the inputs first.
-            units: units of the outputs.
-            publications: list to which publications are added; those before an error are published nevertheless.
-        """
+        """Process a row, with the units of its outputs; publications before an error are published nevertheless."""
         baselines, evaluation = self.baselines, self.evaluation
         if baselines.update.changes:
             self._change_baseline(row.time_ns, publications)
@@ -273,9 +243,8 @@ class PlantPipeline:
             if row.restarted:
                 evaluation.signals.on_restart()
             self._evaluate(measured, changes)
-            evaluation.is_ordinary = not self._board.has_unexplained and evaluation.find_ordinary(
-                time_ns, self._sampling
-            )
+            if not self._board.has_unexplained:
+                evaluation.is_ordinary = evaluation.find_ordinary(time_ns, self._sampling)
         else:
             if not modes.is_judged and modes.is_learned:
                 evaluation.signals.update("outputs", CheckRow(time_ns, measured.values, measured.units), changes)
@@ -313,9 +282,8 @@ class PlantPipeline:
         if not self.has_judged:
             judged = (*e, *(tested if shift.is_active else ()), *(values if charts.reads_values else ()))
             self.has_judged = any(map(isfinite, judged))
-        memory.quarantined = quarantined = tuple(
-            signals.update("residuals", CheckRow(time_ns, e, units, scales), changes)
-        )
+        quarantined = tuple(signals.update("residuals", CheckRow(time_ns, e, units, scales), changes))
+        memory.quarantined = quarantined
         if True in quarantined:
             for whitener, outlier in zip(evaluation.whiteners, quarantined, strict=True):
                 if outlier:
@@ -332,14 +300,7 @@ class PlantPipeline:
     def _publish_estimates(
         self, row: MeasuredRow, predictions: Sequence[float], sds: Sequence[float], scales: Sequence[float]
     ) -> None:
-        """Publish the reference's estimates, with limits about the value that each prewhitening filter expected.
-
-        Args:
-            row: the row.
-            predictions: prediction of each output.
-            sds: standard deviation of each prediction error.
-            scales: standard deviation of each prewhitened residual in the output's unit.
-        """
+        """Publish the reference's estimates, with limits about the value that each prewhitening filter expected."""
         expected, widths = self.evaluation.whitener_numbers["expected"].tolist(), self.evaluation.charts.memory.widths
         limits: list[tuple[float, float, float]] = []
         for prediction, sd, scale, mean, width in zip(predictions, sds, scales, expected, widths, strict=True):
@@ -352,12 +313,7 @@ class PlantPipeline:
     ) -> None:
         """Compare the models, apply the changes of alarms, and let what follows from alarms follow.
 
-        Args:
-            row: the row.
-            changes: changes of alarms so far.
-            before: number of publications before the row.
-            stuck: flags of the outputs whose sensors are stuck; None: an ordinary row, of which the causes are not
-                searched and nothing is learned.
+        Without flags of stuck sensors it is an ordinary row: causes are not searched, and nothing is learned.
         """
         evaluation, memory, board = self.evaluation, self.evaluation.memory, self._board
         reference, publications = evaluation.reference, row.publications
@@ -433,9 +389,6 @@ class PlantPipeline:
     def end_training(self, time_ns: int) -> None:
         """End the training with the rows so far; the next row is the first of another run of the plant.
 
-        Args:
-            time_ns: time of the last row.
-
         Raises:
             InputError: there are too few rows to learn from, or no output can be watched.
         """
@@ -483,14 +436,7 @@ def _publish_estimates(
     predictions: Sequence[float],
     limits: Iterable[tuple[float, float, float]] = repeat((0.0, nan, nan)),
 ) -> None:
-    """Publish estimates of a row's outputs that have a value and a prediction.
-
-    Args:
-        row: the row.
-        paths: key of each output's estimate.
-        predictions: prediction of each output.
-        limits: standard deviation of each residual, and the lower and upper limit of the value; NaN: not learned yet.
-    """
+    """Publish estimates of a row's outputs that have a value and a prediction."""
     of_outputs = zip(paths, predictions, row.values, row.units, strict=True)
     for (path, prediction, value, unit), (sd, lower, upper) in zip(of_outputs, limits, strict=False):
         residual = value - prediction
@@ -498,21 +444,3 @@ def _publish_estimates(
             estimate = Estimate(time_ns=row.time_ns, prediction=prediction, residual=residual, unit=unit)
             estimate.residual_sd, estimate.lower_limit, estimate.upper_limit = sd, lower, upper
             row.publications.append(Publication(path, estimate))
-
-
-def _model(config: MonitorConfig, model: ProcessModel | None) -> ProcessModel | None:
-    """Process model for the plant, as the settings ask for it."""
-    if config.reference in ("black-box", "arx") or (model is None and config.process == WITHOUT_EQUATIONS):
-        return None
-    given, model = model is not None, model or DEFAULT.require_model()
-    fits = config.inputs == model.input_names and set(config.outputs) <= set(model.output_names)
-    if fits:
-        return model
-    if config.reference == "auto" and not given:
-        return None
-    raise InputError(
-        f"reference 'equations' needs the signals of {model.name}, inputs {', '.join(model.input_names)} and outputs "
-        f"of {', '.join(model.output_names)}, got {', '.join(config.inputs) or 'none'} and "
-        f"{', '.join(config.outputs)}; "
-        'set reference = "arx"'
-    )

@@ -35,17 +35,11 @@ from reactorwatch.spc.prewhitening import Prewhitening
 HORIZONS_MIN = (10.0, 60.0, 1440.0)
 FIELDS = ("within_10_min", "within_1_h", "within_1_day")
 RAMP = "ramp"
-ONSETS = 6
-"""Onsets along the first half of the training."""
-
-RUNS = 2
-"""Onsets of which a black box is run."""
 
 MOST_ROWS = 600
 """Rows after an onset that are computed; later ones are like their later half."""
 
-FEWEST_ROWS = 20
-_BIAS_SDS = 1.0
+FEWEST_ROWS = 20  # a training of fewer than two such halves states no power
 
 
 class Deviation(NamedTuple):
@@ -90,12 +84,7 @@ class Watch(NamedTuple):
 
 
 def state_power(watch: Watch, rows: TrainingRows) -> list[Power]:
-    """Sizes of steps, then of ramps, that are seen; empty for a training that is too short.
-
-    Args:
-        watch: the plant.
-        rows: rows of its training.
-    """
+    """Sizes of steps, then of ramps, that are seen; empty for a training that is too short."""
     deviations = _deviations(watch, rows)
     if not deviations:
         return []
@@ -167,7 +156,7 @@ def _causes(watch: Watch, arrays: RowArrays) -> list[Deviation]:
     dynamics = replace(dynamics, whitening=diagonal)
     intervals = window.time_min.size - 1
     rows = min(MOST_ROWS, intervals // 2)
-    onsets = np.linspace(1, intervals - rows, ONSETS).astype(int)
+    onsets = np.linspace(1, intervals - rows, 6).astype(int)
     profile = (np.arange(intervals)[:, None] >= onsets).astype(np.float64)
     found = []
     for index, effect in enumerate(effects):
@@ -182,7 +171,7 @@ def _biases(watch: Watch, arrays: RowArrays) -> list[Deviation]:
     """Biases of the outputs, by the difference that they make to normalised residuals."""
     reference, measured = watch.reference, arrays.outputs
     rows = min(MOST_ROWS, len(measured) // 2)
-    onsets = np.linspace(FEWEST_ROWS // 2, len(measured) - rows, RUNS).astype(int).tolist()
+    onsets = np.linspace(FEWEST_ROWS // 2, len(measured) - rows, 2).astype(int).tolist()
     usual, found = reference.normalised_residuals(arrays), []
     responses = reference.step_responses(rows) if usual is None else None
     for index, name in enumerate(watch.config.outputs):
@@ -192,7 +181,7 @@ def _biases(watch: Watch, arrays: RowArrays) -> list[Deviation]:
         if responses is not None:
             paths[0, :, index] = np.nan_to_num(responses[index])
         if usual is not None:
-            size, runs = _BIAS_SDS * reference.typical_sd[index], []
+            size, runs = reference.typical_sd[index], []
             for onset in onsets:
                 shifted = measured.copy()
                 shifted[onset:, index] += size
@@ -200,12 +189,8 @@ def _biases(watch: Watch, arrays: RowArrays) -> list[Deviation]:
                 change = (np.asarray(found_shifted) - usual) / size
                 runs.append(np.nan_to_num(change[onset : onset + rows]))
             paths = np.stack(runs)
-        found.append(_bias(watch, name, paths))
+        found.append(Deviation(f"{name}.bias", watch.units.get(name, ""), np.inf, _prewhiten(watch, paths)))
     return found
-
-
-def _bias(watch: Watch, name: str, z: Array) -> Deviation:
-    return Deviation(f"{name}.bias", watch.units.get(name, ""), np.inf, _prewhiten(watch, z))
 
 
 def _prewhiten(watch: Watch, z: Array) -> Array:

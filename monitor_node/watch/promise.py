@@ -17,8 +17,8 @@ from scipy.special import pdtrc
 
 from monitor_node.alarms.annunciator import Annunciator
 from monitor_node.charts.chart_design import alarm_names
-from monitor_node.charts.shift import NAME as SHIFT
-from monitor_node.checks.stage import SignalChecks
+from monitor_node.charts.shift_and_drift import NAME as SHIFT
+from monitor_node.checks.signal_checks import SignalChecks
 from monitor_node.config import MonitorConfig
 from monitor_node.health import NODE, Failures
 from monitor_node.learn.baseline import TrainingResult
@@ -30,20 +30,13 @@ from reactorwatch.contract.alarm_states import Event
 from reactorwatch.contract.codec import Publication
 from reactorwatch.contract.messages_pb2 import Alarm, Promise
 from reactorwatch.process.model import ProcessModel
+from reactorwatch.sentences.promise import describe_broken_promise, describe_promise
 from reactorwatch.spc import false_alarm_budget
-from reactorwatch.spc.false_alarm_budget import CONFIDENCE, DAYS, DAYS_MIN, QUANTILE
+from reactorwatch.spc.false_alarm_budget import QUANTILE
 from reactorwatch.stored_state import Memory, Storable
 
 UNLIKELY = 0.003
 """Probability of so many alarms by chance below which the promise is not kept."""
-
-FEWEST_EVENTS = 3
-"""Least number of separate events of a plant that is called drifted: one or two may be faults."""
-
-SAME_EVENT_ROWS = 20
-"""Rows within which alarms are of the same event."""
-
-REMEDY = "train longer, or over more set points"
 
 
 class TrainingCheck(Storable, msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -86,14 +79,9 @@ class PlantPromise(Memory):
     power: bytes = b""
 
     def count_alarms(self, count: int, row: int) -> tuple[bool, bool]:
-        """Count alarms that chance can raise; returns whether the plant had drifted before, and has now.
-
-        Args:
-            count: number of alarms of a row.
-            row: number of rows judged since the training.
-        """
+        """Count alarms that chance can raise; returns whether the plant had drifted before, and has now."""
         had_drifted = self.has_drifted(row)
-        self.events += not self.found or row - self.last_row > SAME_EVENT_ROWS
+        self.events += not self.found or row - self.last_row > 20
         self.found, self.last_row = self.found + count, row
         return had_drifted, self.has_drifted(row)
 
@@ -101,14 +89,12 @@ class PlantPromise(Memory):
         """False alarms promised in a number of rows, on average."""
         return self.per_30_days * rows / self.rows_in_30_days
 
-    def upper_count(self, rows: int) -> float:
-        """Upper bound at 90 % of the false alarms of this plant in a number of rows."""
-        return self.upper_per_30_days * rows / self.rows_in_30_days
-
     def has_drifted(self, rows: int) -> bool:
         """True if more events raised alarms in a number of rows than chance explains, by all that is known."""
-        upper = max(self.check.excess * self.mean_count(rows), self.upper_count(rows))
-        return self.events >= FEWEST_EVENTS and float(pdtrc(self.events - 1, upper)) < UNLIKELY
+        by_training = self.upper_per_30_days * rows / self.rows_in_30_days
+        upper = max(self.check.excess * self.mean_count(rows), by_training)
+        # one or two may be faults
+        return self.events >= 3 and float(pdtrc(self.events - 1, upper)) < UNLIKELY
 
     @property
     def is_kept(self) -> bool:
@@ -123,45 +109,15 @@ class PlantPromise(Memory):
     @property
     def warning(self) -> str:
         """Words for the text of an alarm where the promise is not kept; empty where it is."""
-        if self.is_kept:
-            return ""
-        return f"by its training, false alarms of this plant may come {describe_rate(self.can_keep_per_30_days)}"
+        return "" if self.is_kept else describe_broken_promise(self.can_keep_per_30_days, " of this plant")
 
     def text(self, rows: int) -> str:
         """One sentence for people, after a number of rows."""
-        check = self.check
-        if self.is_kept:
-            parts = [
-                f"false alarms in {DAYS} days: {self.per_30_days:.2g} on average, at most "
-                f"{self.upper_per_30_days:.2g} for this plant with {100 * CONFIDENCE:.0f} % confidence"
-            ]
-            parts.append(
-                f"in the second half of its training, judged by the first, {_count(check.found)}, "
-                f"{check.expected:.2g} promised"
-                if check.rows
-                else "the training was too short to be judged by itself"
-            )
-        else:
-            found = f"{_count(check.found)}, {check.expected:.2g} promised"
-            parts = [
-                (f"in the second half of its training, judged by the first, {found}: " if check.found else "")
-                + "this plant wanders, its model errs after moves of the inputs, or its training has not seen enough of"
-                f" it; from this training {describe_rate(self.can_keep_per_30_days)} can be promised; {REMEDY}"
-            ]
-        if self.found:
-            parts.append(f"{_count(self.found)} since, {self.mean_count(rows):.2g} promised")
-        if self.has_drifted(rows):
-            parts.append("if nothing is wrong, the plant has drifted from its training: train it again")
-        return "; ".join(parts)
+        return self.message(0, rows).text
 
     def message(self, time_ns: int, rows: int) -> Promise:
-        """The message on the bus.
-
-        Args:
-            time_ns: time of the newest row.
-            rows: number of rows judged since the training.
-        """
-        return Promise(
+        """The message on the bus, after a number of rows."""
+        message = Promise(
             time_ns=time_ns,
             expected=self.per_30_days,
             expected_90=self.upper_per_30_days,
@@ -170,39 +126,18 @@ class PlantPromise(Memory):
             expected_in_training=self.check.expected,
             kept=self.is_kept,
             can_keep_per_30_days=self.can_keep_per_30_days,
-            text=self.text(rows),
             rows=rows,
             found=self.found,
             expected_so_far=self.mean_count(rows),
             drifted=self.has_drifted(rows),
             power=Promise.FromString(self.power).power,
         )
-
-
-def _count(alarms: int) -> str:
-    return "1 alarm came" if alarms == 1 else f"{alarms or 'no'} alarms came"
-
-
-def describe_rate(per_30_days: float) -> str:
-    """A rate of alarms in words.
-
-    >>> describe_rate(1080.0), describe_rate(40.0), describe_rate(2.0)
-    ('1 in 40 min', '1 in 18 h', '1 in 15 days')
-    """
-    minutes = DAYS_MIN / per_30_days
-    for unit, size in (("min", 1.0), ("h", 60.0)):
-        if minutes < 100.0 * size:
-            return f"1 in {minutes / size:.2g} {unit}"
-    return f"1 in {minutes / 1440.0:.2g} days"
+        message.text = describe_promise(message)
+        return message
 
 
 def probability_of(found: int, expected: Array) -> float:
-    """Probability of at least so many alarms by chance.
-
-    Args:
-        found: number of alarms.
-        expected: mean number for each of the errors that the training may have made.
-    """
+    """Probability of at least so many alarms by chance."""
     return float(np.mean(pdtrc(found - 1, expected))) if found else 1.0
 
 
@@ -227,23 +162,12 @@ def extrapolate_count(found: int, arl0: float, opportunities: float, wanted_arl0
 
 RAISED = Event.RAISED.value
 
-LEAST_EXCESS = 1.5
-"""Times as many false alarms as promised from which the promise is not kept."""
-
 CheckTraining: TypeAlias = Callable[[MonitorConfig, ProcessModel | None, TrainingRows, str], TrainingCheck]
 """Judges a training by itself, see `promise_check`."""
 
 
 class PromiseStage:
     """The promise of one plant.
-
-    Args:
-        config: settings of the monitor.
-        board: alarms of the plant, whose texts warn of a promise that is not kept.
-        failures: counter of errors, which leave the promise without what they concern.
-        check: judges the training by itself; None: that is not done.
-        states_power: True to state the deviations that would be seen.
-        points: True to publish each promise; False: only one that is not kept or no longer holds.
 
     Attributes:
         alarm_rates: false alarms a row by the errors that the training may have made, shape (draws,), after its end.
@@ -279,30 +203,17 @@ class PromiseStage:
         self._board.warning = "" if promise is None else promise.warning
 
     def start(self, rates: Array, mean_rate: float, period_min: float, excess: float) -> None:
-        """State the promise after a training; alarms so far go on to count.
-
-        Args:
-            rates: see `alarm_rates`.
-            mean_rate: false alarms a row, on average over trainings.
-            period_min: sampling period.
-            excess: times as many false alarms as promised that residuals after moves of the inputs raise.
-        """
+        """State the promise after a training; alarms so far go on to count."""
         self.alarm_rates = rates
         rows = false_alarm_budget.DAYS_MIN / period_min
         mean, upper = rows * mean_rate, rows * float(np.quantile(rates, QUANTILE))
-        check = TrainingCheck(excess=excess if excess > LEAST_EXCESS else 0.0)
+        check = TrainingCheck(excess=excess if excess > 1.5 else 0.0)
         before = self.promise
         counts = (0, 0, 0) if before is None else (before.found, before.events, before.last_row)
         self.promise = PlantPromise(mean, max(mean, upper), rows, check, *counts)
 
     def check(self, trained: TrainingResult, model: ProcessModel | None, watch: Watch | None, rows_watched: int) -> str:
         """Judge the training by itself, and state the power; an error there leaves the promise without them.
-
-        Args:
-            trained: result of the training.
-            model: equations that judge; None: none do.
-            watch: the plant as it is watched, to state its power by; None: that is not stated.
-            rows_watched: number of rows evaluated since.
 
         Returns:
             A note if the promise is not kept, else empty.
@@ -339,12 +250,6 @@ class PromiseStage:
 
     def count_alarms(self, time_ns: int, rows: int, alarms: list[Alarm], publications: list[Publication]) -> str:
         """Count the alarms of a row that chance can raise.
-
-        Args:
-            time_ns: time of the row.
-            rows: number of rows judged since the training.
-            alarms: alarms of the row.
-            publications: publications of the row, to which the promise is added if its counts have changed.
 
         Returns:
             A note if the plant has drifted from its training by this row, else empty.

@@ -35,9 +35,6 @@ _COLUMNS = SETTINGS + max(_SHEWHART, _EWMA, _CUSUM)
 Records: TypeAlias = NDArray[np.void]
 Words: TypeAlias = NDArray[np.int64]
 
-LAST_NS = 0
-"""Word of a plant's numbers that is the time of its newest row."""
-
 HEAD = np.dtype([("last_ns", "i8"), ("period_ns", "f8"), ("time_min", "f8")])
 """Time of the newest row; sampling period; time of the filter's newest row."""
 
@@ -71,13 +68,7 @@ class FrameTypes(NamedTuple):
 
 @lru_cache(maxsize=64)
 def frame_types(inputs: int, outputs: int, alarms: int) -> FrameTypes:
-    """Types of the records of a step, which all plants of a kind share.
-
-    Args:
-        inputs: number of inputs.
-        outputs: number of monitored outputs.
-        alarms: number of alarms that the charts can raise.
-    """
+    """Types of the records of a step, which all plants of a kind share."""
     numbers = [
         *((name, HEAD[name]) for name in HEAD.names or ()),
         ("inputs", "f8", (inputs,)),  # inputs of that row
@@ -150,12 +141,6 @@ _SETTINGS = _WORK + len(Work._fields)
 
 def frame_of(sizes: tuple[int, int, int], scratch: Records, work: Records, settings: Records) -> Words:
     """Sizes of a plant and addresses of the arrays of its step, which the caller keeps alive.
-
-    Args:
-        sizes: numbers of inputs, outputs and alarms.
-        scratch: numbers of one plant, shape (1,).
-        work: results, shape (1,).
-        settings: constants, shape (1,).
 
     Returns:
         the sizes, then the addresses of the fields.

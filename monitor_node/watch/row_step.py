@@ -17,11 +17,10 @@ import numpy as np
 
 from monitor_node.alarms.alarms import add_point, is_ordinary, raises
 from monitor_node.charts.chart_design import alarm_names
-from monitor_node.checks.stage import CHECKS
+from monitor_node.checks.signal_checks import CHECKS
 from monitor_node.config import MonitorConfig
 from monitor_node.ingest.rows import WHOLE
 from monitor_node.learn.references import FilterReference, Reference
-from monitor_node.learn.signal_range import SignalRange
 from monitor_node.watch.row_frame import (
     CHARTS,
     POINT,
@@ -36,10 +35,11 @@ from monitor_node.watch.row_frame import (
     words_of,
     work_at,
 )
+from monitor_node.watched_process import SignalRange
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.compiled_function import CompiledFunction
 from reactorwatch.codegen.numba_kernel import Entry, borrow, call_at, inline, jit
-from reactorwatch.identification.black_box.filter import JUDGED, filter_row
+from reactorwatch.identification.black_box_filter import JUDGED, filter_row
 from reactorwatch.kalman.batch import GATE
 from reactorwatch.kalman.ekf_step import fill_row
 from reactorwatch.records.record import MINUTE_NS
@@ -60,10 +60,6 @@ ORDINARY, VIOLATING, EVENT = 0, 1, 2
 
 CHECKED = {"silence", "stuck", "spike", "range"}
 """Signal checks that the step has."""
-
-MOST_PERIODS = 1.99 - WHOLE
-"""Between rows that are further apart one may be missing."""
-
 
 _fill_row = jit(fill_row)
 
@@ -192,7 +188,8 @@ def step(
     p, work, settings = plant_at(frame), work_at(frame), settings_at(frame)
     head = p.head[0]
     spacing_ns = time_ns - head.last_ns
-    if spacing_ns <= 0 or float(spacing_ns) > MOST_PERIODS * head.period_ns:
+    # rows that are further apart may have one missing between them
+    if spacing_ns <= 0 or float(spacing_ns) > (1.99 - WHOLE) * head.period_ns:
         return EVENT
     for i in range(values.size):
         if not settings.ranges[i, 0] <= values[i] <= settings.ranges[i, 1]:
@@ -230,10 +227,6 @@ _STEP = Entry(step)
 
 class OrdinaryRows:
     """Compiled step of one plant, with the numbers that it updates.
-
-    Args:
-        config: settings of the monitor.
-        ranges: ranges of each input and of each output.
 
     Attributes:
         numbers: numbers of the stages, shape (1,), see `row_frame.FrameTypes`.

@@ -2,101 +2,43 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import msgspec
-
-from monitor_node.replay.backtest import check_training_record, check_watched
-from monitor_node.replay.backtest import run as run_backtest
+from monitor_node.replay.backtest import RecordFacts, check_training_record, check_watched, run
 from monitor_node.watched_process import WatchedProcess, limit_training, watch_process
-from reactorwatch.api.backtest_report import backtest_headline, backtest_object, backtest_text
-from reactorwatch.api.monitor import Suspect, monitor_settings
-from reactorwatch.api.page import write_page
-from reactorwatch.api.record_view import signal_panels, time_title
-from reactorwatch.api.records import ProcessLike
+from reactorwatch import html
+from reactorwatch.api.monitor import monitor_settings
+from reactorwatch.api.records import ProcessLike, signal_panels
+from reactorwatch.api.shown import Shown, page_of
 from reactorwatch.contract.codec import encode
-from reactorwatch.description.find import find_process
-from reactorwatch.notebook import html
-from reactorwatch.notebook.figures import ALARM, Mark, draw_panels
-from reactorwatch.notebook.frames import frame_of_rows
+from reactorwatch.description.read import find_process
+from reactorwatch.figures import Mark, Panel
+from reactorwatch.optional import frame_of_rows
 from reactorwatch.records.record import Record
+from reactorwatch.results.alarms import RaisedAlarm
+from reactorwatch.results.backtest import Backtest
+from reactorwatch.sentences.backtest import backtest_headline, backtest_text, exclusion_sentences, training_sentence
 from recorder.tools.player import samples_of
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
     from pandas import DataFrame
 
 COLUMNS = ("alarm", "priority", "raised_min", "cleared_min", "signals", "cause", "probability")
 """Columns of the data frame."""
 
-TRAINING = "#7f7f7f"
 
+class BacktestResult(Shown[Backtest]):
+    """A `Backtest` with its record: its attributes are the fields of `reactorwatch backtest --json`."""
 
-class RaisedAlarm(msgspec.Struct, frozen=True):
-    """An alarm of a back-test.
+    @property
+    def headline(self) -> list[str]:
+        """Outcome in a line for each incident, the largest first, after doubts about the training."""
+        return backtest_headline(self.result)
 
-    Attributes:
-        alarm: name of the alarm, `chart/signal`.
-        priority: `low`, `medium`, `high` or `critical`.
-        raised_min: minute in which it was raised.
-        cleared_min: minute in which it was cleared; None: it is active at the end.
-        signals: signals that contributed to it.
-        contributions: share of each of them.
-        suspect: likely causes, the likeliest first.
-    """
-
-    alarm: str
-    priority: str
-    raised_min: float
-    cleared_min: float | None
-    signals: list[str]
-    contributions: list[dict[str, Any]]
-    suspect: list[Suspect]
-
-
-class BacktestResult(msgspec.Struct, frozen=True):
-    """Result of a back-test; its fields are those of `reactorwatch backtest --json`.
-
-    Attributes:
-        watched: False if no row could be judged.
-        why: reason why none could; None: one was judged.
-        samples: number of rows.
-        zero: clock time that the minutes count from, ISO 8601; None: unknown.
-        span_min: time from the first row to the last, summed over the runs.
-        runs: number of runs of the plant.
-        trained_until_min: end of the training; None: the record is shorter.
-        expected_false_alarms: number of alarms expected by chance after the training.
-        promise: promise of false alarms, and how training and rows bear it out; None: no row was judged.
-        power: for each deviation the sizes that are seen within 10 min, an hour and a day.
-        signals: inputs, outputs, and signals that are not watched with the reason.
-        reference: model that the rows are judged by, `equations` or `arx`; None: no row was judged.
-        noise_levels: standard deviations of the equations' noise; None: they did not judge.
-        baseline: change of the equations after the diagnosis of the training; None: they stayed as given.
-        alarms: the alarms in the order in which they were raised.
-        headline: outcome in a line for each incident, the largest first, after doubts about the training.
-        text: report as `reactorwatch backtest` prints it.
-        record: the record.
-    """
-
-    watched: bool
-    why: str | None
-    samples: int
-    zero: str | None
-    span_min: float
-    runs: int
-    trained_until_min: float | None
-    expected_false_alarms: float
-    promise: dict[str, Any] | None
-    power: list[dict[str, Any]]
-    signals: dict[str, Any]
-    reference: str | None
-    noise_levels: dict[str, dict[str, float]] | None
-    baseline: dict[str, Any] | None
-    alarms: list[RaisedAlarm]
-    headline: list[str]
-    text: str
-    record: Any = None
+    @property
+    def text(self) -> str:
+        """Report as `reactorwatch backtest` prints it."""
+        return backtest_text(self.result)
 
     def __str__(self) -> str:
         return self.text
@@ -109,17 +51,12 @@ class BacktestResult(msgspec.Struct, frozen=True):
         for alarm, cause in zip(self.alarms, _new_causes(self.alarms), strict=True):
             cleared = "" if alarm.cleared_min is None else f"{alarm.cleared_min:g}"
             rows.append((f"{alarm.raised_min:g}", cleared, alarm.alarm, alarm.priority, cause))
-        trained = self.trained_until_min
         parts = [
             *map(html.headline, self.headline),
-            html.sentence(
-                f"Nothing was watched: {self.why}."
-                if trained is None
-                else f"Trained until {trained:g} min; {self.expected_false_alarms:.2g} false alarms are expected later."
-            ),
+            html.sentence(training_sentence(self.result)),
             html.table(("raised, min", "cleared, min", "alarm", "priority", "likely cause"), rows),
+            *map(html.sentence, exclusion_sentences(self.result)),
         ]
-        parts += [html.sentence(f"{item['signal']} is not watched: {item['why']}") for item in self.signals["left_out"]]
         return "".join(parts)
 
     def to_frame(self) -> "DataFrame":
@@ -130,32 +67,21 @@ class BacktestResult(msgspec.Struct, frozen=True):
         """
         return frame_of_rows([_row(alarm) for alarm in self.alarms], COLUMNS)
 
-    def plot(self) -> "Figure":
-        """Plot the watched signals with the training and the spans in which an alarm was active.
-
-        Raises:
-            InputError: matplotlib is not installed.
-        """
+    def _panels(self) -> list[Panel]:
         record: Record = self.record
-        inputs, outputs = tuple(self.signals["inputs"]), tuple(self.signals["outputs"])
+        inputs, outputs = tuple(self.result.signals.inputs), tuple(self.result.signals.outputs)
         end_min = float(record.continuous_min[-1])
         marks = []
         if self.runs == 1:
             if self.trained_until_min is not None:
-                marks.append(Mark(float(record.time_min[0]), "training", TRAINING, end=self.trained_until_min))
+                marks.append(Mark(float(record.time_min[0]), "training", "measured", end=self.trained_until_min))
             spans = _merge_spans([(item.raised_min, item.cleared_min or end_min) for item in self.alarms])
-            marks += [Mark(start, "alarm" if not n else "", ALARM, end=end) for n, (start, end) in enumerate(spans)]
-        panels = signal_panels(record, inputs, names=(*outputs, *inputs))
-        return draw_panels(panels, marks, time_title(record))
+            marks += [Mark(start, "alarm" if not n else "", "alarm", end=end) for n, (start, end) in enumerate(spans)]
+        return signal_panels(record, inputs, names=(*outputs, *inputs), marks=tuple(marks))
 
-    def to_html(self, file: str | Path) -> None:
-        """Write the alarms and the plots as one page.
-
-        Raises:
-            InputError: the file cannot be written.
-        """
+    def _page(self) -> str:
         name = self.record.name
-        write_page(file, f"Back-test of {name}", self._repr_html_(), self.plot, name)
+        return page_of(f"Back-test of {name}", self._repr_html_(), self._panels(), name)
 
 
 def backtest(record: Record, process: ProcessLike | None = None, **settings: Any) -> BacktestResult:
@@ -180,17 +106,11 @@ def backtest(record: Record, process: ProcessLike | None = None, **settings: Any
         watched = watch_process(config, described, record.rows)
         still = check_training_record(record, *watched)
     zero_ns = replace(record, zero_ns=0).stored_zero_ns  # so that the minutes of a model are those of the record
-    publications = samples_of(record, config.plant, zero_ns)
-    result = run_backtest((encode(item) for item in publications), watched.config, zero_ns, watched.model)
-    result.left_out = still | result.left_out
-    check_watched(record.name, result)
-    found = backtest_object(result, zero_ns, record.zero)
-    clock_ns = record.zero_ns or None
-    outcome = {
-        "headline": backtest_headline(result, zero_ns, clock_ns),
-        "text": backtest_text(result, zero_ns, Path(record.name), clock_ns),
-    }
-    return msgspec.convert(found | outcome | {"record": record}, BacktestResult)
+    messages = (encode(item) for item in samples_of(record, config.plant, zero_ns))
+    facts = RecordFacts(record.name, record.zero_ns - zero_ns if record.zero_ns else None, still)
+    result = run(messages, watched.config, zero_ns, watched.model, facts=facts)
+    check_watched(record.name, watched.config.outputs, result)
+    return BacktestResult(result, record)
 
 
 def _merge_spans(spans: list[tuple[float, float]]) -> list[tuple[float, float]]:

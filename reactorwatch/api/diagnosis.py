@@ -2,39 +2,35 @@
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import msgspec
+from msgspec.structs import replace
 
+from reactorwatch import html
 from reactorwatch.api.records import ProcessLike, check_signals, process_of
-from reactorwatch.api.report_origin import report_origin
-from reactorwatch.description.find import find_process
+from reactorwatch.api.shown import Shown, report_origin
 from reactorwatch.description.process import Process
+from reactorwatch.description.read import find_process
 from reactorwatch.description.toml_file import add_description
 from reactorwatch.diagnosis.diagnose import diagnose as find_causes
 from reactorwatch.diagnosis.record_checks import make_run
-from reactorwatch.diagnosis.report.machine import report_object
-from reactorwatch.diagnosis.report.words import describe_causes, describe_size, describe_timing, describe_verdict
+from reactorwatch.diagnosis.report.panels import outputs
 from reactorwatch.diagnosis.result import Diagnosis
-from reactorwatch.notebook import html
-from reactorwatch.notebook.figures import MEASURED, MODEL, Line, Mark, Panel, draw_panels
-from reactorwatch.notebook.frames import frame_of_rows
+from reactorwatch.figures import Panel
+from reactorwatch.optional import frame_of_rows
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.extended_model import parse_extended_model
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import Record
-from reactorwatch.records.write import atomic_write
+from reactorwatch.sentences.diagnosis import describe_causes, describe_size, describe_timing, describe_verdict
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
     from pandas import DataFrame
 
 COLUMNS = ("explanation", "delta_bic", "cause", "profile", "label", "location", "size", "size_sd", "unit", "onset_min")
 """Columns of the data frame."""
-
-AFTER = "#2ca02c"
 
 
 class Case(NamedTuple):
@@ -45,48 +41,39 @@ class Case(NamedTuple):
         process: the process, on the clock of the record, with the equations of the simulation.
         effects: possible causes.
         uncertain: standard deviations of uncertain parameters, by name.
+        file: name of the record as given; empty: its own.
     """
 
     record: Record
     process: Process
     effects: tuple[Effect, ...]
     uncertain: dict[str, float]
+    file: str = ""
 
 
-@dataclass(frozen=True)
-class DiagnosisResult(Diagnosis):
-    """A `Diagnosis` with the record and the model that it compares.
+class DiagnosisResult(Shown[Diagnosis]):
+    """A `Diagnosis` with its record and the model that it compares with it.
 
     Attributes:
-        record: the measured record.
         model: the simulation before it was extended.
         effects: possible causes.
-        seconds: duration of the diagnosis.
     """
 
-    record: Record = field(kw_only=True, repr=False, compare=False)
-    model: ProcessModel = field(kw_only=True, repr=False, compare=False)
-    effects: tuple[Effect, ...] = field(kw_only=True, repr=False, compare=False)
-    seconds: float = field(kw_only=True, repr=False, compare=False)
+    def __init__(self, result: Diagnosis, record: Record, model: ProcessModel, effects: tuple[Effect, ...]) -> None:
+        super().__init__(result, record)
+        self.model, self.effects = model, effects
 
-    @property
-    def file(self) -> str:
-        """Name of the record."""
-        return self.record.name
-
-    @property
-    def zero(self) -> str | None:
-        """Clock time from which the minutes count, as ISO 8601; None: unknown."""
-        return self.record.zero
+    def __repr__(self) -> str:
+        return f"<{describe_verdict(self.result)}>"
 
     @property
     def extended(self) -> ProcessModel:
         """The model with the causes in it: a process for `simulate`, `diagnose` and `backtest`."""
-        return parse_extended_model(msgspec.json.encode(self.extended_model)).build()
+        return parse_extended_model(msgspec.json.encode(self.result.extended_model)).build()
 
     def to_dict(self) -> dict[str, Any]:
         """The object that `reactorwatch diagnose --json` prints, and the differences of the simulation."""
-        return report_object(self, self.file, self.seconds, self.zero)
+        return self.result.to_dict("differences")
 
     def _repr_html_(self) -> str:
         causes = [
@@ -100,7 +87,7 @@ class DiagnosisResult(Diagnosis):
         ]
         return "".join(
             [
-                html.headline(describe_verdict(self)),
+                html.headline(describe_verdict(self.result)),
                 html.table(("cause", "name", "where", "size (95 %)", "when"), causes),
                 html.table(("or", "worse by, in BIC"), others),
                 html.table(("error of the simulation", "as it was", "extended", "noise"), errors),
@@ -124,41 +111,14 @@ class DiagnosisResult(Diagnosis):
                 rows.append(dict(zip(COLUMNS, (*values, *sizes), strict=True)))
         return frame_of_rows(rows, COLUMNS)
 
-    def plot(self) -> "Figure":
-        """Plot the measured outputs with the simulation as it was and the extended one, and the onsets of causes.
+    def _panels(self) -> list[Panel]:
+        return outputs(self.result, self.model)
 
-        Raises:
-            InputError: matplotlib is not installed.
-        """
-        curves, panels = self.curves, []
-        assert curves is not None, "a diagnosis of a record has curves"
-        for name, measured in curves.measured.items():
-            lines = [
-                Line("measured", curves.time_min, measured, MEASURED),
-                Line("simulation as it was", curves.time_min, curves.simulated_before[name], MODEL),
-            ]
-            if self.causes:
-                lines.append(Line("extended simulation", curves.time_min, curves.simulated_after[name], AFTER))
-            panels.append(Panel(f"{name}, {self.model.units[name]}", tuple(lines)))
-        marks = [
-            Mark(item.parameters["onset"].value + item.run_shift_min, item.label)
-            for item in self.causes
-            if "onset" in item.parameters
-        ]
-        return draw_panels(panels, marks)
-
-    def to_html(self, file: str | Path) -> None:
-        """Write the report as one page.
-
-        Raises:
-            InputError: the file cannot be written.
-        """
+    def _page(self) -> str:
         from reactorwatch.diagnosis.report.page import as_page
 
         names, origin = (self.record.name, "extended.json", "experiment.csv"), report_origin(Path(self.record.name), {})
-        page = as_page(self, self.model, self.effects, *names, on_the_bus=False, origin=origin)
-        with atomic_write(Path(file)) as temporary:
-            temporary.write_text(page, encoding="utf-8")
+        return as_page(self.result, self.model, self.effects, *names, on_the_bus=False, origin=origin)
 
 
 def diagnose(
@@ -202,7 +162,10 @@ def diagnose_case(case: Case, tolerance: dict[str, float], limits: dict[str, tup
     """
     started, model = time.monotonic(), case.process.require_model()
     found = find_causes(case.record, model, case.effects, tolerance or None, case.uncertain, limits or None)
-    values = {item.name: getattr(found, item.name) for item in fields(found)}
-    values["extended_model"] = add_description(found.extended_model, case.process)
-    seconds = time.monotonic() - started
-    return DiagnosisResult(**values, record=case.record, model=model, effects=case.effects, seconds=seconds)
+    result = replace(
+        found,
+        file=case.file or found.file,
+        extended_model=add_description(found.extended_model, case.process),
+        seconds=round(time.monotonic() - started, 3),
+    )
+    return DiagnosisResult(result, case.record, model, case.effects)

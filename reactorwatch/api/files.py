@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, NamedTuple
 
 from reactorwatch.contract.codec import Encoded, encode
 from reactorwatch.contract.keys import DEFAULT_PLANT, check_plant
-from reactorwatch.description.find import DEFAULT_CHOICE, ProcessChoice
+from reactorwatch.description.read import DEFAULT_CHOICE, ProcessChoice
 from reactorwatch.errors import InputError
 from reactorwatch.records.decode import TABLE_SUFFIXES, is_table, list_files
 from reactorwatch.records.file_format import GUESS, FileFormat
-from reactorwatch.records.record import Record, format_utc
+from reactorwatch.records.record import Record
 
 if TYPE_CHECKING:
     from reactorwatch.description.process import Process
@@ -40,8 +40,7 @@ def record(
     Raises:
         InputError: the file is neither a table nor an .mcap, or is malformed.
     """
-    from reactorwatch.description.find import find_process
-    from reactorwatch.description.read import convert_to_process, read_process_table
+    from reactorwatch.description.read import convert_to_process, find_process, read_process_table
 
     described = process or find_process()
     if file_kind(path) == "mcap":
@@ -109,14 +108,6 @@ class MessageSource(NamedTuple):
     process: "Process | None" = None
     measured: Record | None = None
 
-    def zero(self, first_ns: int) -> str | None:
-        """Time from which the minutes are counted, as ISO 8601; None: unknown.
-
-        Args:
-            first_ns: time of the first sample.
-        """
-        return format_utc(first_ns if self.zero_ns is None else self.zero_ns) if self.has_clock else None
-
 
 def open_messages(
     path: Path,
@@ -156,8 +147,7 @@ def open_messages(
         encoded = (encode(item) for item in publications)
         zero_ns, has_clock_time = measured.stored_zero_ns, bool(measured.zero_ns)
         return MessageSource(encoded, zero_ns, has_clock_time, measured.read_as, choice.load(), measured)
-    from recorder.files.metadata import ZERO_NS
-    from recorder.files.recording import Recording, has_clock, zero_from
+    from recorder.files.recording import ZERO_NS, Recording, has_clock, zero_from
 
     recording = Recording(path)
     read, metadata = (Encoded(*entry[:4]) for entry in recording.messages(plant=plant)), recording.metadata
@@ -175,8 +165,7 @@ def expand_folder(folder: Path) -> list[Path]:
     Raises:
         InputError: the folder holds neither.
     """
-    from recorder.files.metadata import FILE_INDEX
-    from recorder.files.recording import Recording, live_file
+    from recorder.files.recording import FILE_INDEX, Recording, live_file
 
     one_recording = {FILE_INDEX, "cut", "merged"}
     records, recordings = (list_files(folder, suffix) for suffix in (".csv", ".mcap"))

@@ -2,61 +2,39 @@
 
 from collections.abc import Sequence
 from dataclasses import fields
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import msgspec
-
-from reactorwatch.api.page import write_page
+from reactorwatch import html
 from reactorwatch.api.records import ProcessLike, process_of
-from reactorwatch.description.find import find_process
+from reactorwatch.api.shown import Shown, page_of
+from reactorwatch.description.read import find_process
 from reactorwatch.errors import InputError, describe_unknown
+from reactorwatch.figures import Line, Panel
 from reactorwatch.identification.data import Dataset
-from reactorwatch.identification.identify import HeldOutRun, Identification, ModelForm, identify_and_run
-from reactorwatch.notebook import html
-from reactorwatch.notebook.figures import MEASURED, MODEL, Line, Panel, draw_panels
-from reactorwatch.notebook.frames import make_frame
+from reactorwatch.identification.identify import Identification, ModelForm
+from reactorwatch.identification.identify import identify as fit_model
+from reactorwatch.optional import make_frame
 from reactorwatch.records.record import Record
+from reactorwatch.sentences.models import identification_headline
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
     from pandas import DataFrame
 
-STEP = "#2ca02c"
 
-
-class IdentificationResult(Identification, frozen=True, kw_only=True):
-    """An `Identification` with its run on the held-out rows.
-
-    Attributes:
-        run: measured, predicted and simulated output on the held-out rows.
-        record: the record that was fitted.
-    """
-
-    run: HeldOutRun
-    record: Record
+class IdentificationResult(Shown[Identification]):
+    """An `Identification` with the record that was fitted."""
 
     def __repr__(self) -> str:
         return f"<{self.model} of order {self.order} for {self.output}: free run {self.fit.free_run:.2f} %>"
 
     def _repr_html_(self) -> str:
-        fit = self.fit_percent
         return "".join(
             [
-                html.headline(
-                    f"{self.model} of order {self.order}, delay {self.delay}, for {self.output}: "
-                    f"free run {fit.free_run:.2f} %, one step {fit.one_step:.2f} %"
-                ),
+                html.headline(identification_headline(self.result)),
                 html.sentence(f"{self.rows} rows were fitted; the fits are of rows that were not."),
                 html.table(("check", "result"), self.checks.items()),
             ]
         )
-
-    def to_dict(self) -> dict[str, Any]:
-        """The object that `reactorwatch identify --json` prints."""
-        names = Identification.__struct_fields__
-        found: dict[str, Any] = msgspec.to_builtins(Identification(**{name: getattr(self, name) for name in names}))
-        return found
 
     def to_frame(self) -> "DataFrame":
         """Held-out rows: the output measured, predicted one step ahead and simulated.
@@ -68,33 +46,23 @@ class IdentificationResult(Identification, frozen=True, kw_only=True):
         values = {name: run.measured, f"{name}.one_step": run.one_step, f"{name}.free_run": run.free}
         return make_frame({"time_min": run.time, **values}, "time_min")
 
-    def plot(self) -> "Figure":
-        """Plot the held-out rows with the simulation and the one-step-ahead prediction, and their errors.
-
-        Raises:
-            InputError: matplotlib is not installed.
-        """
+    def _panels(self) -> list[Panel]:
         run, unit = self.run, self.record.units.get(self.output, "")
         lines = (
-            Line("measured", run.time, run.measured, MEASURED),
-            Line("free run", run.time, run.free, MODEL),
-            Line("one step", run.time, run.one_step, STEP),
+            Line("measured", run.time, run.measured),
+            Line("free run", run.time, run.free, "before"),
+            Line("one step", run.time, run.one_step, "after"),
         )
         errors = (
-            Line("free run", run.time, run.measured - run.free, MODEL),
-            Line("one step", run.time, run.measured - run.one_step, STEP),
+            Line("free run", run.time, run.measured - run.free, "before"),
+            Line("one step", run.time, run.measured - run.one_step, "after"),
         )
         in_unit = f", {unit}" if unit else ""
-        return draw_panels([Panel(f"{self.output}{in_unit}", lines), Panel(f"error{in_unit}", errors)])
+        return [Panel(f"{self.output}{in_unit}", lines), Panel(f"error{in_unit}", errors)]
 
-    def to_html(self, file: str | Path) -> None:
-        """Write the result with its figure as one page.
-
-        Raises:
-            InputError: the file cannot be written.
-        """
+    def _page(self) -> str:
         title = f"{self.model.upper()} model of {self.output}: {self.record.name}"
-        write_page(file, title, self._repr_html_(), self.plot, self.record.name)
+        return page_of(title, self._repr_html_(), self._panels(), self.record.name)
 
 
 def identify(
@@ -132,6 +100,4 @@ def identify(
         inputs = (input,) if isinstance(input, str) else tuple(input)
     held_out = None if validate is None else Dataset.of_record(validate, inputs, output)
     data = Dataset.of_record(record, inputs, output)
-    found, run = identify_and_run(data, ModelForm(**form), held_out, settle)
-    values = {name: getattr(found, name) for name in Identification.__struct_fields__}
-    return IdentificationResult(**values, run=run, record=record)
+    return IdentificationResult(fit_model(data, ModelForm(**form), held_out, settle), record)

@@ -1,8 +1,9 @@
 """A monitor that is fed from Python."""
 
 from collections.abc import Iterable, Iterator, Mapping
+from datetime import datetime
 from math import isfinite
-from typing import Any
+from typing import Any, TypeAlias
 
 import msgspec
 from google.protobuf.message import Message
@@ -12,34 +13,18 @@ from monitor_node.core import Monitor as MonitorCore
 from monitor_node.diagnosis_worker import find_deviations
 from monitor_node.watched_process import load_process, watch_process
 from reactorwatch.api.records import ProcessLike
-from reactorwatch.api.rows import iterate_rows
 from reactorwatch.contract import keys
-from reactorwatch.contract.alarm_text import NewSuspects, priority_word
 from reactorwatch.contract.codec import Publication, encode
 from reactorwatch.contract.messages_pb2 import Alarm, Incident, Quality, Sample
 from reactorwatch.contract.messages_pb2 import Suspect as SuspectMessage
-from reactorwatch.description.find import find_process
+from reactorwatch.contract.suspects import NewSuspects
 from reactorwatch.description.process import Process
+from reactorwatch.description.read import find_process
 from reactorwatch.errors import InputError
-from reactorwatch.records.record import to_minutes, to_time_ns
+from reactorwatch.records.record import Record, to_minutes, to_time_ns
+from reactorwatch.results.alarms import Suspect
 from reactorwatch.runtime.config import section
-
-
-class Suspect(msgspec.Struct, frozen=True):
-    """A cause that an alarm may come from.
-
-    Attributes:
-        cause: name in the catalogue, or `unknown`.
-        probability: probability of the cause.
-        text: meaning of its size in words; empty: not known.
-    """
-
-    cause: str
-    probability: float
-    text: str = ""
-
-    def __str__(self) -> str:
-        return f"{self.text or self.cause.replace('_', ' ')} ({100 * self.probability:.0f} %)"
+from reactorwatch.sentences.alarm import priority_word
 
 
 class AlarmChange(msgspec.Struct, frozen=True):
@@ -166,7 +151,7 @@ class Monitor:
 
 
 def _alarm_change(alarm: Alarm, event: str, suspects: Iterable[SuspectMessage]) -> AlarmChange:
-    causes = [Suspect(item.cause, item.probability, item.text) for item in suspects]
+    causes = [Suspect.of(item) for item in suspects]
     return AlarmChange(to_minutes(alarm.time_ns), alarm.alarm, event, priority_word(alarm.priority), alarm.text, causes)
 
 
@@ -182,3 +167,58 @@ def monitor_settings(settings: Mapping[str, Any], process: Process | None = None
     """
     about = {"plant": keys.DEFAULT_PLANT, **settings} | ({} if process is None else {"process": process.name})
     return section(MonitorConfig, "monitor", {}, about)
+
+
+Row: TypeAlias = tuple[float, dict[str, float]]
+"""Minute, and values by signal; NaN: not measured."""
+
+
+def iterate_rows(source: Any, time: str = "time_min") -> Iterator[Row]:
+    """Iterate over rows.
+
+    Args:
+        source: a record; a data frame (pandas or polars); or an iterable of mappings, such as a `csv.DictReader`, a
+            generator that reads a socket, or a database cursor with rows by name.
+        time: name of the column with the time: minutes, or clock times (`datetime`), which are counted from the first.
+
+    Raises:
+        InputError: a row has no time, or a cell is no number.
+    """
+    if isinstance(source, Record):
+        for row, minute in enumerate(source.time_min.tolist()):
+            yield minute, {name: float(values[row]) for name, values in source.columns.items()}
+        return
+    zero: datetime | None = None
+    for number, row in enumerate(_mappings(source)):
+        if not isinstance(row, Mapping):
+            raise InputError(f"row {number}: must be a mapping of names to values, got {type(row).__name__}")
+        if time not in row:
+            raise InputError(f"row {number}: has no {time!r}, only {', '.join(map(str, row))}; name it with time=")
+        moment = row[time]
+        if isinstance(moment, datetime):
+            zero = zero or moment
+            minute = (moment - zero).total_seconds() / 60
+        else:
+            minute = _number(moment, time, number)
+        yield minute, {str(name): _number(value, str(name), number) for name, value in row.items() if name != time}
+
+
+def _mappings(source: Any) -> Iterator[Any]:
+    """Rows of a data frame by name; another iterable as it is."""
+    if hasattr(source, "iter_rows"):  # polars
+        yield from source.iter_rows(named=True)
+    elif hasattr(source, "itertuples"):  # pandas
+        flat = source if source.index.name is None else source.reset_index()
+        names = list(flat.columns)
+        yield from (dict(zip(names, row, strict=True)) for row in flat.itertuples(index=False, name=None))
+    else:
+        yield from source
+
+
+def _number(value: Any, name: str, number: int) -> float:
+    if value is None or value == "":
+        return float("nan")
+    try:
+        return float(value)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"row {number}: {name} must be a number, got {value!r}") from error

@@ -8,14 +8,15 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
+from reactorwatch import html
 from reactorwatch.api.files import described_process
 from reactorwatch.api.files import record as read_file
-from reactorwatch.api.page import write_page
-from reactorwatch.api.record_view import plot_record, record_frame, record_html
-from reactorwatch.description.find import DEFAULT_PROCESS, find_process
+from reactorwatch.api.shown import Drawn, page_of
 from reactorwatch.description.process import Process
-from reactorwatch.description.read import convert_to_process
+from reactorwatch.description.read import DEFAULT_PROCESS, convert_to_process, find_process
 from reactorwatch.errors import InputError, describe_unknown
+from reactorwatch.figures import Line, Mark, Panel
+from reactorwatch.optional import make_frame
 from reactorwatch.process import MODELS
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.model import ProcessModel
@@ -25,7 +26,6 @@ from reactorwatch.records.record import Record as MeasuredRecord
 from reactorwatch.records.write import write_frame
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
     from pandas import DataFrame
 
 ProcessLike: TypeAlias = str | Path | Process | ProcessModel
@@ -44,7 +44,7 @@ FRAME = "data frame"
 
 
 @dataclass(frozen=True, init=False)
-class Record(MeasuredRecord):
+class Record(Drawn, MeasuredRecord):
     """A measured record with its process.
 
     Attributes:
@@ -104,21 +104,11 @@ class Record(MeasuredRecord):
         """
         return record_frame(self)
 
-    def plot(self) -> "Figure":
-        """Plot all signals over time.
+    def _panels(self) -> list[Panel]:
+        return signal_panels(self, self.inputs)
 
-        Raises:
-            InputError: matplotlib is not installed.
-        """
-        return plot_record(self, self.inputs)
-
-    def to_html(self, file: str | Path) -> None:
-        """Write the ranges and plots of the signals as one page.
-
-        Raises:
-            InputError: the file cannot be written.
-        """
-        write_page(file, self.name, self._repr_html_(), self.plot, self.name)
+    def _page(self) -> str:
+        return page_of(self.name, self._repr_html_(), self._panels(), self.name)
 
 
 def _check_arrays(
@@ -266,3 +256,57 @@ def effects(process: ProcessLike = DEFAULT_PROCESS) -> tuple[Effect, ...]:
     'pump_gain'
     """
     return find_process(process).causes
+
+
+def record_frame(record: MeasuredRecord) -> "DataFrame":
+    """Rows of a record with the index `time_min`, or with the clock time if it is known."""
+    columns = {"run": record.runs, **record.columns} if record.runs is not None else dict(record.columns)
+    if not record.zero_ns:
+        return make_frame({"time_min": record.time_min, **columns}, "time_min")
+    times = record.zero_ns + np.round(record.time_min * 60e6).astype(np.int64) * 1000
+    return make_frame({"time": times.astype("datetime64[ns]"), "time_min": record.time_min, **columns}, "time")
+
+
+def record_html(record: MeasuredRecord) -> str:
+    """Rows, span and remarks of a record, and the range of each signal."""
+    since = f", minutes since {record.zero}" if record.zero else ""
+    rows = []
+    for name, values in record.columns.items():
+        known = values[np.isfinite(values)]
+        low, high = (f"{known.min():.6g}", f"{known.max():.6g}") if known.size else ("", "")
+        rows.append((name, record.units.get(name, ""), low, high, record.rows - known.size or ""))
+    return "".join(
+        [
+            html.headline(f"{record.name}: {record.rows} rows over {record.span_min:g} min{since}"),
+            *map(html.sentence, record.remarks),
+            html.table(("signal", "unit", "lowest", "highest", "missing"), rows),
+        ]
+    )
+
+
+def signal_panels(
+    record: MeasuredRecord,
+    inputs: tuple[str, ...],
+    simulated: MeasuredRecord | None = None,
+    names: tuple[str, ...] | None = None,
+    marks: tuple[Mark, ...] = (),
+) -> list[Panel]:
+    """A panel for each signal, outputs first, with their simulation.
+
+    Args:
+        record: the measured record.
+        inputs: names of its inputs.
+        simulated: simulation in the same rows; None: there is none.
+        names: signals that are shown; None: all.
+        marks: moments and spans in all panels.
+    """
+    shown = [name for name in record.columns if names is None or name in names]
+    panels, x_title = [], f"min since {record.zero}" if record.zero else "min"
+    for name in sorted(shown, key=lambda item: item in inputs):
+        unit, is_input = record.units.get(name, ""), name in inputs
+        kind, label = ("input", name) if is_input else ("after" if simulated is None else "measured", "measured")
+        lines = [Line(label, record.continuous_min, record.columns[name], kind, is_input)]
+        if simulated is not None and not is_input and name in simulated.columns:
+            lines.append(Line("simulated", simulated.continuous_min, simulated.columns[name], "before"))
+        panels.append(Panel(f"{name}, {unit}" if unit else name, tuple(lines), marks, x_title))
+    return panels

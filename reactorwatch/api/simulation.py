@@ -3,18 +3,24 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any
 
-import msgspec
 import numpy as np
 
-from reactorwatch.api.record_view import plot_record, record_html
-from reactorwatch.api.records import ProcessLike, Record, measured_fields, model_of, process_of
+from reactorwatch import html
+from reactorwatch.api.records import (
+    ProcessLike,
+    Record,
+    measured_fields,
+    model_of,
+    process_of,
+    record_html,
+    signal_panels,
+)
 from reactorwatch.arrays import Array
-from reactorwatch.diagnosis.impossible_values import check_values
-from reactorwatch.diagnosis.units import find_wrong_unit
+from reactorwatch.diagnosis.record_checks import check_values, find_wrong_unit
 from reactorwatch.errors import InputError
-from reactorwatch.notebook import html
+from reactorwatch.figures import Panel
 from reactorwatch.process import named_effects
 from reactorwatch.process.fault import parse_fault
 from reactorwatch.process.law import laws_of
@@ -23,21 +29,7 @@ from reactorwatch.process.simulate import Simulator
 from reactorwatch.process.steady_state import complete_state
 from reactorwatch.records.record import Record as MeasuredRecord
 from reactorwatch.records.record import join_runs
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-
-class Rmse(NamedTuple):
-    """Root mean square difference between a simulated and a measured output.
-
-    Attributes:
-        value: the difference.
-        unit: unit of the output.
-    """
-
-    value: float
-    unit: str
+from reactorwatch.results.simulation import Rmse, SimulationReport
 
 
 @dataclass(frozen=True, init=False)
@@ -61,15 +53,10 @@ class Simulation(Record):
         rows = [(name, f"{item.value:.3g} {item.unit}") for name, item in self.rmse.items()]
         return record_html(self) + html.table(("output", "root mean square difference from the record"), rows)
 
-    def plot(self) -> "Figure":
-        """Plot the measured and the simulated signals.
-
-        Raises:
-            InputError: matplotlib is not installed.
-        """
+    def _panels(self) -> list[Panel]:
         if self.measured is None:
-            return super().plot()
-        return plot_record(self.measured, self.inputs, self)
+            return super()._panels()
+        return signal_panels(self.measured, self.inputs, self)
 
 
 def simulate(
@@ -190,15 +177,9 @@ def _fit_start(simulator: Simulator, measured: MeasuredRecord, inputs: Array, st
 
 
 def report(
-    measured: MeasuredRecord,
-    simulated: MeasuredRecord,
-    model: ProcessModel,
-    out: Path | None,
-    *,
-    settle: int = 0,
-    as_json: bool,
-) -> str:
-    """Format the root mean square difference between simulation and record, by signal.
+    measured: MeasuredRecord, simulated: MeasuredRecord, model: ProcessModel, out: Path | None, settle: int = 0
+) -> SimulationReport:
+    """Compare a simulation with its record.
 
     Args:
         measured: the record.
@@ -206,20 +187,13 @@ def report(
         model: the process.
         out: file of the simulation; None: it could not be written.
         settle: first rows of each run that are left out.
-        as_json: format as a JSON object.
     """
-    rmse = root_mean_squares(measured, simulated, model, settle)
     remarks = [sentence for law in laws_of(model) for sentence in law.outside(simulated.columns)]
-    if as_json:
-        result = {
-            "file": None if out is None else str(out),
-            "rows": measured.rows,
-            "runs": len(measured.run_starts),
-            "rmse": {name: item._asdict() for name, item in rmse.items()},
-            **({"remarks": remarks} if model.laws else {}),
-        }
-        return msgspec.json.encode(result).decode()
-    parts = ", ".join(f"{name} {item.value:.3g} {item.unit}" for name, item in rmse.items())
-    written = "not written" if out is None else f"wrote {out}"
-    line = f"{written}: {measured.rows} rows; root mean square difference from the record: {parts}"
-    return "\n".join([line, *(f"note: {remark}" for remark in [*measured.remarks, *remarks])])
+    return SimulationReport(
+        file=None if out is None else str(out),
+        rows=measured.rows,
+        runs=len(measured.run_starts),
+        rmse=root_mean_squares(measured, simulated, model, settle),
+        remarks=remarks if model.laws else None,
+        notes=tuple(measured.remarks),
+    )

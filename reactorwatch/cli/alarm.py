@@ -234,7 +234,7 @@ def _show(
 
 
 def _alarm_object(alarm: "Alarm") -> dict[str, object]:
-    from reactorwatch.contract.alarm_text import priority_word, state_word
+    from reactorwatch.sentences.alarm import priority_word, state_word
 
     return {
         "alarm": alarm.alarm,
@@ -255,7 +255,7 @@ def _alarm_object(alarm: "Alarm") -> dict[str, object]:
 
 
 def _alarm_line(alarm: "Alarm") -> str:
-    from reactorwatch.contract.alarm_text import describe_suspects, format_moment, priority_word, state_word
+    from reactorwatch.sentences.alarm import describe_suspects, format_moment, priority_word, state_word
 
     parts = [f"{alarm.alarm} ({priority_word(alarm.priority)}): {state_word(alarm.state)}"]
     if alarm.shelved_until_ns:
@@ -285,7 +285,7 @@ def _baseline_object(item: "Baseline") -> dict[str, object]:
 
 
 def _baseline_line(item: "Baseline") -> str:
-    from reactorwatch.contract.alarm_text import format_moment
+    from reactorwatch.sentences.alarm import format_moment
 
     since = f" from {format_moment(item.time_ns)}" if item.time_ns else " from the start"
     restored = f" {item.restored}" if item.what == "restore" else ""

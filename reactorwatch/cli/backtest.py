@@ -12,8 +12,8 @@ import numpy as np
 
 from monitor_node.config import DEFAULT, DEFAULT_TRAINING_ROWS, MonitorConfig
 from monitor_node.replay.backtest import (
-    Backtest,
     LoggedRow,
+    RecordFacts,
     RowLog,
     TrainedPlant,
     check_training_record,
@@ -23,8 +23,6 @@ from monitor_node.replay.backtest import (
     train,
 )
 from monitor_node.watched_process import WatchedProcess, limit_training, load_process, watch_process
-from reactorwatch.api.alarm_lines import group_by_cause
-from reactorwatch.api.backtest_report import backtest_object, backtest_text
 from reactorwatch.api.files import MessageSource, open_messages, resolve_plant
 from reactorwatch.cli.batch import FileOptions, Job, JobKind, JobResult, Row, as_table, unit_remark
 from reactorwatch.cli.display import json_line
@@ -32,13 +30,16 @@ from reactorwatch.cli.options import check_recording
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import DecodeError, Encoded, decode
 from reactorwatch.contract.messages_pb2 import Sample
-from reactorwatch.description.find import DEFAULT_PROCESS, ProcessChoice
 from reactorwatch.description.process import Process
+from reactorwatch.description.read import DEFAULT_PROCESS, ProcessChoice
 from reactorwatch.errors import prefix_errors
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.decode import quote_formula
 from reactorwatch.records.record import to_minutes, to_time_ns
 from reactorwatch.records.write import atomic_write
+from reactorwatch.results.backtest import Backtest
+from reactorwatch.sentences.backtest import backtest_text
+from reactorwatch.sentences.incidents import group_by_cause
 
 ROWS_FOR_TRAINING = 3 * DEFAULT_TRAINING_ROWS
 """Rows that are counted to find a third of a record; of a longer one the training is not limited."""
@@ -100,27 +101,18 @@ def run_job(job: Job[BacktestOptions]) -> JobResult:
     opened = _open(job.at, asked, learns=asked.trained is None)
     source, (config, model) = opened.source, opened.watched
     first, log = FirstSamples(config.plant), RowLog() if asked.log_rows else None
-    result = run(first.collect_samples(source.messages), config, source.zero_ns or 0, model, asked.trained, log)
-    result.left_out = opened.still | result.left_out
-    check_watched(job.at, result)
-    zero_ns = result.first_ns if source.zero_ns is None else source.zero_ns
-    zero = source.zero(result.first_ns)
-    found = backtest_object(result, zero_ns, zero, is_trained=asked.trained is not None)
+    facts = RecordFacts(str(job.file), 0 if source.has_clock else None, opened.still)
+    result = run(first.collect_samples(source.messages), config, source.zero_ns, model, asked.trained, log, facts)
+    check_watched(job.at, config.outputs, result)
     if asked.as_json:
-        text = json_line({"file": str(job.file), **found} if asked.is_one_of_many else found)
+        text = json_line(result.to_dict("file") if asked.is_one_of_many else result.to_dict())
     else:
-        text = backtest_text(result, zero_ns, job.file, zero_ns if zero else None, is_trained=asked.trained is not None)
+        text = backtest_text(result)
     remarks = [f"read as: {source.read_as}"] if source.read_as else []
     if opened.process is None or model is not None:
         remarks += filter(None, [first.remark(model or DEFAULT.require_model())])
-    logged = None if log is None else RowsOfFile(job.file, _logged_rows(log, source, zero_ns), zero_ns)
-    return JobResult(
-        text,
-        _row(job.file, found, result, zero_ns),
-        remark="; ".join(remarks),
-        not_watched=result.not_watched,
-        extra=logged,
-    )
+    rows = None if log is None else RowsOfFile(job.file, _logged_rows(log, source, result.zero_ns), result.zero_ns)
+    return JobResult(text, _row(result), remark="; ".join(remarks), not_watched=result.why or "", extra=rows)
 
 
 def _open(file: Path, asked: BacktestOptions, *, learns: bool) -> _Opened:
@@ -177,21 +169,23 @@ _COLUMNS = ("samples", "span_min", "trained_until_min", "expected_false_alarms",
 _OF_ALARMS = ("alarms", "first_alarm", "first_alarm_min", "suspect")
 
 
-def _row(file: Path, found: dict[str, Any], result: Backtest, zero_ns: int) -> Row:
+def _row(result: Backtest) -> Row:
     """Row of a file; the first alarm and the suspect are those of the largest incident."""
-    found = found | {"trustworthy": result.promise and result.promise.kept}
+    values = (
+        *(result.samples, result.span_min, result.trained_until_min, result.expected_false_alarms),
+        result.promise and result.promise.kept,
+    )
     of_alarms: tuple[Any, ...] = (0, None, None, None)
-    for largest, *_ in group_by_cause(result.raised_alarms)[:1]:
-        first = largest.raised[0][0]
-        suspect = largest.suspect or next(iter(first.suspects), None)
+    for largest, *_ in group_by_cause(result.alarms)[:1]:
+        first = largest.raised[0]
+        suspect = largest.suspect or next(iter(first.suspect), None)
         cause = None if suspect is None else suspect.cause
-        of_alarms = (len(result.raised_alarms), first.alarm, to_minutes(first.raised_ns, zero_ns), cause)
+        of_alarms = (len(result.alarms), first.alarm, first.raised_min, cause)
     return {
-        "file": str(file),
-        "watched": found["watched"],
-        **{name: found[name] for name in _COLUMNS},
-        **dict(zip(_OF_ALARMS, of_alarms, strict=True)),
-        "error": found["why"],
+        "file": result.file,
+        "watched": result.watched,
+        **dict(zip((*_COLUMNS, *_OF_ALARMS), (*values, *of_alarms), strict=True)),
+        "error": result.why,
     }
 
 

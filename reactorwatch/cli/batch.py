@@ -19,15 +19,14 @@ import typer
 from reactorwatch.api.files import expand_folder
 from reactorwatch.arrays import Array
 from reactorwatch.cli.display import bar, format_rows, json_line, print_lines, print_report, task
-from reactorwatch.description.find import DEFAULT_CHOICE, ProcessChoice
-from reactorwatch.diagnosis.units import find_wrong_unit
+from reactorwatch.description.read import DEFAULT_CHOICE, ProcessChoice
+from reactorwatch.diagnosis.record_checks import find_wrong_unit
 from reactorwatch.errors import InputError, UnfitRecordError
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.decode import list_files, quote_formula
 from reactorwatch.records.file_format import GUESS, FileFormat
 from reactorwatch.records.write import atomic_write, fill_folder
-from reactorwatch.runtime.executors import choose_executor
-from reactorwatch.runtime.jobs import Failed, in_job_order
+from reactorwatch.runtime.jobs import Failed, choose_executor, in_job_order
 
 SUMMARY = SUMMARY_OBJECT, SUMMARY_TABLE = "summary.json", "summary.csv"
 Item = TypeVar("Item")

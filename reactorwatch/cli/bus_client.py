@@ -15,7 +15,7 @@ from reactorwatch.errors import InputError
 from reactorwatch.runtime.bus_zenoh import ZenohBus, connect
 from reactorwatch.runtime.config import BusConfig, LogConfig, MetricsConfig, read_settings, section
 from reactorwatch.runtime.event_loop import StopSignal
-from reactorwatch.runtime.logs import configure
+from reactorwatch.runtime.node_main import configure_log
 from recorder.config import RecorderConfig
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 def load_settings(target: BusOptions, level: int = logging.WARNING) -> tuple[dict[str, dict[str, Any]], BusConfig]:
     """Configure the log; returns the tables of the settings, and the bus settings."""
-    configure(level)
+    configure_log(level)
     tables = read_settings(target.config)
     return tables, section(BusConfig, "bus", tables, {"endpoint": target.endpoint})
 
@@ -37,7 +37,7 @@ def load_recorder_settings(target: PlantOptions, level: int = logging.WARNING) -
 
 def observed_process(process: str | None, recorder: RecorderConfig) -> "Process | None":
     """Process of the plant that is observed."""
-    from reactorwatch.description.find import PlantProcesses, find_process
+    from reactorwatch.description.read import PlantProcesses, find_process
 
     return PlantProcesses(recorder.processes).find(recorder.plant) if process is None else find_process(process)
 
@@ -95,7 +95,7 @@ def send_command(node: str, client: ClientOptions, name: str, message: Message) 
 def node_settings(target: BusOptions) -> tuple[dict[str, dict[str, Any]], BusConfig]:
     """Configure the log of a node; returns the tables of the settings, and the bus settings."""
     tables = read_settings(target.config)
-    configure(as_json=section(LogConfig, "log", tables, {}).format == "json")
+    configure_log(as_json=section(LogConfig, "log", tables, {}).format == "json")
     return tables, section(BusConfig, "bus", tables, {"endpoint": target.endpoint})
 
 

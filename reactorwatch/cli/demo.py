@@ -28,11 +28,10 @@ from reactorwatch.cli.processes import (
     write_node_settings,
 )
 from reactorwatch.contract import keys
-from reactorwatch.contract.alarm_text import suspects_text
 from reactorwatch.contract.codec import Encoded, decode
 from reactorwatch.contract.messages_pb2 import Alarm, Fault, Incident, Sample
-from reactorwatch.description.find import DEFAULT_PROCESS, find_process
 from reactorwatch.description.process import Process
+from reactorwatch.description.read import DEFAULT_PROCESS, find_process
 from reactorwatch.diagnosis.result import NAMED, Diagnosis
 from reactorwatch.errors import InputError
 from reactorwatch.process.effect import Effect
@@ -41,10 +40,10 @@ from reactorwatch.records.record import MINUTE_NS, to_minutes, to_time_ns
 from reactorwatch.records.write import atomic_write, make_folder
 from reactorwatch.runtime.bus_zenoh import ZenohBus
 from reactorwatch.runtime.config import section
-from reactorwatch.runtime.crash import INTERRUPTED
 from reactorwatch.runtime.event_loop import StopSignal, stop_on_signals
-from reactorwatch.runtime.logs import configure
-from reactorwatch.runtime.loopback import free_endpoint
+from reactorwatch.runtime.http_pages import free_endpoint
+from reactorwatch.runtime.node_main import INTERRUPTED, configure_log
+from reactorwatch.sentences.alarm import suspects_text
 from reactorwatch.terminal import printable_lines
 from recorder.config import RecorderConfig
 from recorder.core import DISK_ALARM
@@ -75,7 +74,7 @@ def choose_fault(text: str | None, process: Process) -> FaultSpecification:
 
 def run(flags: dict[str, Any], fault: str | None, out: Path | None, site: Path | None = None) -> int:
     """Run the demonstration."""
-    configure()
+    configure_log()
     process = find_process(flags["process"] or DEFAULT_PROCESS)
     injected = str(choose_fault(fault, process))
     join = load_bus_settings(site, PLANT, {}, free_endpoint() if site is None else None)
@@ -166,7 +165,7 @@ def _conclude(folder: Path, recording: Path, monitor: MonitorConfig, fault: str)
     """Diagnose and draw the recording, and write the summary; returns the exit code."""
     from reactorwatch.api.diagnosis import diagnose_case
     from reactorwatch.cli.diagnose import DRAWING, MODEL, PAGE, DiagnosisOptions, load_case, write_report
-    from reactorwatch.diagnosis.report.words import describe_verdict
+    from reactorwatch.sentences.diagnosis import describe_verdict
     from recorder.columns import read_segments
     from recorder.view.file import write_rrd
 
@@ -198,7 +197,7 @@ def _conclude(folder: Path, recording: Path, monitor: MonitorConfig, fault: str)
     lines = [
         "# What happened",
         "",
-        headline(delay_s, diagnosis, diagnosis.effects),
+        headline(delay_s, diagnosis.result, diagnosis.effects),
         "",
         f"- Fault injected: `{fault}`, onset at {minutes(onset_ns)}."
         if onset_ns is not None
@@ -222,7 +221,7 @@ def _conclude(folder: Path, recording: Path, monitor: MonitorConfig, fault: str)
         + (", ".join(f"`{alarm.alarm}` at {minutes(alarm.time_ns)}" for alarm in before) or "none")
         + f" ({again.expected_false_alarms:.2g} expected in the whole run)."
     )
-    lines.append(f"- Diagnosis of the whole recording: {describe_verdict(diagnosis)}")
+    lines.append(f"- Diagnosis of the whole recording: {describe_verdict(diagnosis.result)}")
     lines.append(f"- Back-test over the recording: {'the same alarms, value for value' if same else 'OTHER ALARMS'}.")
     lines += [
         "",

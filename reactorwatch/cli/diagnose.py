@@ -3,6 +3,7 @@
 Errors in the options, not in a file, are raised before the first job.
 """
 
+import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from importlib.util import find_spec
@@ -15,25 +16,23 @@ from numpy.typing import NDArray
 
 from reactorwatch.api.diagnosis import Case, DiagnosisResult, diagnose_case
 from reactorwatch.api.files import record_of_process
-from reactorwatch.api.report_origin import report_origin
+from reactorwatch.api.shown import report_origin
 from reactorwatch.arrays import Array
 from reactorwatch.cli.batch import SUMMARY, FileOptions, Job, JobKind, JobResult, Row, as_table, make_jobs
 from reactorwatch.cli.display import json_line
 from reactorwatch.cli.options import check_recording
-from reactorwatch.diagnosis.experiment.constraints import check_limits
+from reactorwatch.diagnosis.experiment.inputs import check_limits
 from reactorwatch.diagnosis.parameter_priors import parse_priors
 from reactorwatch.diagnosis.practical_significance import check_tolerance
 from reactorwatch.diagnosis.record_checks import make_run
-from reactorwatch.diagnosis.report.machine import as_object, report_object
-from reactorwatch.diagnosis.report.pictures import interval
-from reactorwatch.diagnosis.report.plain import as_text
+from reactorwatch.diagnosis.report.panels import interval
 from reactorwatch.diagnosis.result import SD_95, Cause, Curves, Diagnosis, Experiment
 from reactorwatch.errors import InputError, UnfitRecordError
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.decode import is_table
 from reactorwatch.records.record import Record, to_time_ns
 from reactorwatch.records.write import atomic_write, check_output_folder, fill_folder, write_table
-from reactorwatch.runtime.model_file import write_extended_model
+from reactorwatch.sentences.diagnosis import diagnosis_text
 from recorder.panels.base import ALARM, INPUT, LIMIT, MEASURED, PREDICTED, Colour, Series, TimePlot
 
 PAGE, OBJECT, MODEL, DRAWING = "report.html", "report.json", "extended.json", "report.rrd"
@@ -64,7 +63,7 @@ def load_case(file: Path, asked: DiagnosisOptions) -> Case:
     model = process.require_model(UnfitRecordError)
     priors = {} if asked.uncertain is None else parse_priors(asked.uncertain, model)
     make_run(measured, model)
-    return Case(measured, process, process.select_causes(asked.without), process.uncertain | priors)
+    return Case(measured, process, process.select_causes(asked.without), process.uncertain | priors, str(file))
 
 
 def write_report(found: DiagnosisResult, file: Path, folder: Path, asked: DiagnosisOptions) -> None:
@@ -82,15 +81,14 @@ def write_report(found: DiagnosisResult, file: Path, folder: Path, asked: Diagno
         "limits": asked.limits,
         "columns": asked.columns,
     }
-    page = as_page(found, found.model, found.effects, *files, origin=report_origin(file, settings))
-    report = report_object(found, str(file), found.seconds, found.zero)
-    plain = msgspec.json.format(msgspec.json.encode(report), indent=2)
+    page = as_page(found.result, found.model, found.effects, *files, origin=report_origin(file, settings))
+    plain = msgspec.json.format(msgspec.json.encode(found.to_dict()), indent=2)
     with fill_folder(folder) as temporary:
         write_extended_model(temporary / MODEL, found.extended_model)
         if found.experiment is not None:
             _write_experiment(found.experiment, temporary / EXPERIMENT)
         if find_spec("rerun") is not None:  # an image of nodes that never draw is without
-            write_drawing(found, found.model, found.record, temporary / DRAWING)
+            write_drawing(found.result, found.model, found.record, temporary / DRAWING)
         for name, content in ((OBJECT, plain + b"\n"), (PAGE, page.encode())):
             with atomic_write(temporary / name) as written:
                 written.write_bytes(content)
@@ -127,15 +125,15 @@ def check_out(files: Sequence[Path], out: Path | None, model: Path | None, *, fo
 
 def run_job(job: Job[DiagnosisOptions]) -> JobResult:
     """Diagnose a file, and write its report if there is a folder for it."""
-    found = diagnose_case(load_case(job.at, job.asked), job.asked.tolerance, job.asked.limits)
-    not_written, report = "", as_object(found, str(job.file), found.seconds, found.zero)
+    case, not_written = load_case(job.at, job.asked)._replace(file=str(job.file)), ""
+    found = diagnose_case(case, job.asked.tolerance, job.asked.limits)
     if job.folder is not None:
         try:
             write_report(found, job.file, job.folder, job.asked)
         except InputError as error:
             not_written = str(error)
-    text = json_line(report) if job.asked.as_json else _text(job, found, has_report=not not_written)
-    return JobResult(text, _row(report, found) | {"error": not_written or None}, not_written=not_written)
+    text = json_line(found.result.to_dict()) if job.asked.as_json else _text(job, found, has_report=not not_written)
+    return JobResult(text, _row(found.result) | {"error": not_written or None}, not_written=not_written)
 
 
 def _check(asked: DiagnosisOptions) -> None:
@@ -149,7 +147,7 @@ def _check(asked: DiagnosisOptions) -> None:
 
 
 def _text(job: Job[DiagnosisOptions], found: DiagnosisResult, *, has_report: bool) -> str:
-    text = as_text(found, str(job.file), found.effects)
+    text = diagnosis_text(found.result, found.effects)
     if job.folder is None or not has_report:
         return text
     if found.experiment is not None:
@@ -160,9 +158,10 @@ def _text(job: Job[DiagnosisOptions], found: DiagnosisResult, *, has_report: boo
 _COLUMNS = ("samples", "span_min", "seconds", "verdict", "causes", "location", "significant", "practical", "delta_bic")
 
 
-def _row(report: dict[str, Any], found: DiagnosisResult) -> Row:
-    row = report | {"causes": " + ".join(map(_fault_text, found.causes)), "delta_bic": report["gain"]["delta_bic"]}
-    return {"file": row["file"], "watched": True} | {name: row[name] for name in _COLUMNS}
+def _row(found: Diagnosis) -> Row:
+    row = found.to_dict()
+    row |= {"causes": " + ".join(map(_fault_text, found.causes)), "delta_bic": row["gain"]["delta_bic"]}
+    return {"file": found.file, "watched": True} | {name: row[name] for name in _COLUMNS}
 
 
 def _fault_text(cause: Cause) -> str:
@@ -250,3 +249,13 @@ def _plots(diagnosis: Diagnosis, curves: Curves, model: ProcessModel, time_ns: N
     for given in model.inputs:
         held = Series(given.name, time_ns, curves.inputs[given.name], INPUT, held=True)
         yield TimePlot(f"{given.meaning} {given.name}", given.unit, (held,))
+
+
+def write_extended_model(path: Path, written: dict[str, Any]) -> None:
+    """Write the object from `ExtendedModel.to_object`; the file appears complete or not at all.
+
+    Raises:
+        InputError: the folder does not exist or cannot be written to.
+    """
+    with atomic_write(path) as temporary:
+        temporary.write_text(json.dumps(written, indent=2) + "\n", encoding="utf-8")

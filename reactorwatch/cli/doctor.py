@@ -21,10 +21,10 @@ from monitor_node.health import OtherMonitors
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import DecodeError, Encoded, decode
 from reactorwatch.contract.messages_pb2 import Health
+from reactorwatch.runtime.acl import Role, kinds_of, parse_common_name
 from reactorwatch.runtime.bus_zenoh import ZenohBus, connect_now
+from reactorwatch.runtime.certificates import read_certificate, read_common_name, read_key
 from reactorwatch.runtime.config import BusConfig
-from reactorwatch.runtime.security.acl import Role, kinds_of, parse_common_name
-from reactorwatch.runtime.security.certificates import read_certificate, read_common_name, read_key
 from reactorwatch.version import version
 
 RENEW_DAYS = 30

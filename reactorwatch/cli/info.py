@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from reactorwatch.contract.alarm_text import format_moment, priority_word
 from reactorwatch.description.process import ROLES, Process
 from reactorwatch.records.record import Record, format_utc, to_minutes
+from reactorwatch.sentences.alarm import format_moment, priority_word
 from reactorwatch.terminal import printable_lines
 from recorder.files.copies import RecoveryResult
 from recorder.files.recording import has_clock

@@ -18,7 +18,7 @@ import platformdirs
 import structlog
 
 from monitor_node.config import MonitorConfig
-from monitor_node.fleet.monitor import ANY, PlantKind, prepare
+from monitor_node.fleet import ANY, PlantKind, prepare
 from monitor_node.replay import backtest
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record

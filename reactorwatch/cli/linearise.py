@@ -8,9 +8,8 @@ import numpy as np
 
 from reactorwatch.arrays import Array
 from reactorwatch.errors import InputError
-from reactorwatch.process.linearise import compare_step, linearise
 from reactorwatch.process.model import ProcessModel
-from reactorwatch.process.steady_state import SteadyState, steady_states
+from reactorwatch.process.steady_state import SteadyState, compare_step, linearise, steady_states
 
 STEP_SHARE = 0.1
 """Default step of an input, as a share of its scale."""

@@ -1,6 +1,6 @@
 """Entry of the command: its subcommands, and one line and exit code 2 for a usage error.
 
-Any other error is a fault of this software and is reported as in every process (`runtime/crash.py`).
+Any other error is a fault of this software and is reported as in every process (`runtime/node_main.py`).
 
 Only the imports for `--help` are here; each command imports its own when it is called.
 """
@@ -21,7 +21,7 @@ from typer.core import TyperGroup
 from reactorwatch.cli import alarm, my_data, my_plant, recordings, site, studies
 from reactorwatch.cli.display import print_lines
 from reactorwatch.cli.option_groups import Command, add_commands
-from reactorwatch.runtime.crash import INTERRUPTED, UNUSABLE, guard, print_error
+from reactorwatch.runtime.node_main import INTERRUPTED, UNUSABLE, guard, print_error
 from reactorwatch.version import this_build
 
 # Typer brings a copy of click, or uses the one installed, depending on its version; its errors are one family in both.

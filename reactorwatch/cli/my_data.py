@@ -279,8 +279,7 @@ def causes(
     from reactorwatch.api.files import record_of_process
     from reactorwatch.cli.causes import as_json_text, as_matrix
     from reactorwatch.diagnosis.identifiability import identifiability
-    from reactorwatch.diagnosis.record_checks import make_run
-    from reactorwatch.diagnosis.usual_excitation import excite
+    from reactorwatch.diagnosis.record_checks import excite, make_run
 
     choice = chosen.choose()
     if record is None:
@@ -320,6 +319,7 @@ def simulate(
     from reactorwatch.api.files import record_of_process
     from reactorwatch.api.simulation import report, simulate_along
     from reactorwatch.records.write import WRITTEN_SUFFIXES, write_table
+    from reactorwatch.sentences.models import simulation_text
 
     choice = chosen.choose()
     out = check_output(out, WRITTEN_SUFFIXES, (file, choice.file), force=force)
@@ -331,10 +331,13 @@ def simulate(
         simulated = simulate_along(measured, model, fault or [], settle)
         try:
             write_table(out, simulated)
-        except InputError:
-            print_report(report(measured, simulated, model, None, settle=settle, as_json=as_json), as_json=as_json)
-            raise
-    print_report(report(measured, simulated, model, out, settle=settle, as_json=as_json), as_json=as_json)
+            not_written = None
+        except InputError as error:
+            not_written = error
+    found = report(measured, simulated, model, None if not_written else out, settle)
+    print_report(json_line(found.to_dict()) if as_json else simulation_text(found), as_json=as_json)
+    if not_written is not None:
+        raise not_written
 
 
 def example(

@@ -23,7 +23,7 @@ from reactorwatch.errors import InputError
 from reactorwatch.records.file_format import GUESS
 
 if TYPE_CHECKING:
-    from reactorwatch.description.find import ProcessChoice
+    from reactorwatch.description.read import ProcessChoice
 
 
 def up(
@@ -137,7 +137,7 @@ def monitor(
 
     from monitor_node.__main__ import run
     from monitor_node.config import MonitorConfig
-    from monitor_node.fleet.config import FleetConfig
+    from monitor_node.fleet import FleetConfig
     from monitor_node.watched_process import load_process
     from reactorwatch.cli.bus_client import metrics_settings, node_settings
     from reactorwatch.cli.kernels import compile_at_first_start, is_first_start
@@ -229,7 +229,7 @@ def view(
     from dataclasses import replace
 
     from reactorwatch.cli.bus_client import load_recorder_settings, observed_process
-    from reactorwatch.description.find import find_process
+    from reactorwatch.description.read import find_process
     from recorder.view.viewer import DisplayTarget, show
 
     if chosen.process is not None and target.config is None:

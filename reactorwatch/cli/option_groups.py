@@ -22,7 +22,7 @@ from reactorwatch.errors import InputError
 from reactorwatch.records.file_format import FileFormat
 
 if TYPE_CHECKING:
-    from reactorwatch.description.find import ProcessChoice
+    from reactorwatch.description.read import ProcessChoice
 
 FILE, BUS = "file", "bus"
 GROUPS = {FILE: "How to read the file", BUS: "Bus and settings"}
@@ -143,7 +143,7 @@ class ProcessOption:
 
     def choose(self) -> "ProcessChoice":
         """Choice of the process."""
-        from reactorwatch.description.find import ProcessChoice
+        from reactorwatch.description.read import ProcessChoice
 
         return ProcessChoice(self.process)
 
@@ -163,7 +163,7 @@ class ProcessOptions(ProcessOption):
 
     def choose(self, modes: list[str] | None = None) -> "ProcessChoice":
         """Choice of the process; the modes are columns that say how a process without a description is operated."""
-        from reactorwatch.description.find import ProcessChoice
+        from reactorwatch.description.read import ProcessChoice
 
         return ProcessChoice(self.process, *(tuple(split_at_commas(it)) for it in (self.inputs, self.outputs, modes)))
 

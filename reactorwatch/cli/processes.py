@@ -30,7 +30,7 @@ from reactorwatch.records.write import atomic_write
 from reactorwatch.runtime.bus_zenoh import ZenohBus, log_refusals, router, router_from_file
 from reactorwatch.runtime.config import BusConfig, read_settings, section
 from reactorwatch.runtime.node_main import SUPERVISED
-from reactorwatch.runtime.security.provisioning import ROUTER, ROUTER_SETTINGS, SETTINGS
+from reactorwatch.runtime.provisioning import ROUTER, ROUTER_SETTINGS, SETTINGS
 from recorder.config import RecorderConfig
 
 log = structlog.get_logger()

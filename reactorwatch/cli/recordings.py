@@ -242,7 +242,7 @@ def recover(
     """Recover the intact messages of a damaged recording."""
     from reactorwatch.cli.info import saved_object, saved_text
     from recorder.files.copies import recover as save
-    from recorder.files.part_file import is_locked
+    from recorder.files.writer import is_locked
 
     if is_locked(check_input(file)):
         raise InputError(f"{file}: is still being written; stop its recorder first")
@@ -263,8 +263,7 @@ def cut(
     """Copy a span of plant time out of a recording."""
     from recorder.files.copies import cut as copy
     from recorder.files.copies import sample_window
-    from recorder.files.metadata import ZERO_NS
-    from recorder.files.recording import Recording
+    from recorder.files.recording import ZERO_NS, Recording
     from recorder.tools.inspect import zero_ns_of
 
     from_ns = parse_span_ns(begin, "--from") if begin is not None else -(2**63)

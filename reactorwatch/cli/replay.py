@@ -10,15 +10,14 @@ from monitor_node.replay.verification import COMPARED, Verification, verify
 from reactorwatch.cli.display import json_line, print_lines, print_report, task
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded
-from reactorwatch.description.find import ProcessChoice, find_in_catalogue, find_process
 from reactorwatch.description.process import Process
+from reactorwatch.description.read import ProcessChoice, find_in_catalogue, find_process
 from reactorwatch.errors import InputError
 from reactorwatch.records.decode import is_table
 from reactorwatch.records.record import format_utc, to_minutes
 from reactorwatch.runtime.config import parse_tables, read_settings, section
 from reactorwatch.version import UNKNOWN, describe_build, this_build
-from recorder.files.metadata import gaps_of
-from recorder.files.recording import Recording, has_clock
+from recorder.files.recording import Recording, gaps_of, has_clock
 from recorder.tools.inspect import zero_ns_of
 
 SETTINGS = "settings"

@@ -49,7 +49,7 @@ def certify(
     """
     from datetime import UTC, datetime
 
-    from reactorwatch.runtime.security.provisioning import AUTHORITY, ROUTER, ROUTER_SETTINGS, make_site
+    from reactorwatch.runtime.provisioning import AUTHORITY, ROUTER, ROUTER_SETTINGS, make_site
 
     now, revoked = datetime.now(UTC), tuple(revoke or ())
     for made in make_site(folder, tuple(plant or ()), endpoint, listen, days, now, renew_days=renew, revoke=revoked):
@@ -80,15 +80,14 @@ def router(
     from reactorwatch.runtime.bus_zenoh import log_refusals, router_from_file
     from reactorwatch.runtime.bus_zenoh import router as plain_router
     from reactorwatch.runtime.config import BusConfig, LogConfig, read_settings, section
-    from reactorwatch.runtime.event_loop import stop_on_signals
-    from reactorwatch.runtime.logs import configure
-    from reactorwatch.runtime.retry import retry
+    from reactorwatch.runtime.event_loop import retry, stop_on_signals
+    from reactorwatch.runtime.node_main import configure_log
 
     if file is not None and (target.config is not None or target.endpoint is not None):
         raise InputError(f"{file}: has the address of this router; leave out --config and --endpoint")
     tables = read_settings(target.config)
     settings = section(BusConfig, "bus", tables, {"endpoint": target.endpoint})
-    configure(as_json=section(LogConfig, "log", tables, {}).format == "json")
+    configure_log(as_json=section(LogConfig, "log", tables, {}).format == "json")
     log = structlog.get_logger()
     with log_refusals(), stop_on_signals() as stop:
         bus = retry(

@@ -13,7 +13,6 @@ from reactorwatch.cli.bus_client import connect_within
 from reactorwatch.cli.display import Screen, json_line, print_lines, print_screen_text, screen
 from reactorwatch.cli.status_view import ANNUNCIATED, SECOND_NS, Now, age_s, format_plant, sort_alarms
 from reactorwatch.contract import keys
-from reactorwatch.contract.alarm_text import priority_word, set_suspects, state_word
 from reactorwatch.contract.codec import DecodeError, Encoded, decode, encode_message
 from reactorwatch.contract.messages_pb2 import (
     Alarm,
@@ -25,11 +24,13 @@ from reactorwatch.contract.messages_pb2 import (
     Sample,
     Suspect,
 )
-from reactorwatch.contract.promise_text import promise_fields
+from reactorwatch.contract.suspects import set_suspects
 from reactorwatch.errors import InputError
+from reactorwatch.results.promise import state_promise
 from reactorwatch.runtime.bus_zenoh import ZenohBus, connect_now
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.event_loop import StopSignal, stop_on_signals
+from reactorwatch.sentences.alarm import priority_word, state_word
 from reactorwatch.terminal import printable
 
 if TYPE_CHECKING:
@@ -125,13 +126,15 @@ class StatusBoard:
             samples = sum(count for item, count in counts.items() if second - span_s <= item < second)
             nodes = {node for plant, node in (*self._alive, *self._health) if plant == name}
             now = self._now(name, now_ns)
+            promise, power = state_promise(self._promises.get(name))
             return {
                 "plant": name,
                 "samples_per_s": samples / span_s if span_s > 0 else None,
                 "signals": self._signals(name),
                 "nodes": [self._node(name, node, now_ns) for node in sorted(nodes)],
                 "alarms": [_alarm(alarm, now) for alarm in self._visible_alarms(name)],
-                **promise_fields(self._promises.get(name)),
+                "promise": promise,
+                "power": power,
             }
 
     def text(self, now_ns: int, to: Screen = Screen()) -> str:  # noqa: B008 (it is frozen)

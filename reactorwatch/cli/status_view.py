@@ -18,10 +18,10 @@ from reactorwatch.cli.display import (
     format_rows,
     wrap_line,
 )
-from reactorwatch.contract.alarm_text import describe_suspects, priority_word, state_word
 from reactorwatch.contract.keys import RECORDING
 from reactorwatch.contract.messages_pb2 import Alarm, AlarmState, Priority
-from reactorwatch.contract.promise_text import describe_power
+from reactorwatch.sentences.alarm import describe_suspects, priority_word, state_word
+from reactorwatch.sentences.promise import describe_power
 
 HEADER = tuple(Cell(word, FAINT) for word in ("priority", "incident", "alarm", "state", "for", "likely cause"))
 SECOND_NS = 1_000_000_000
@@ -130,8 +130,8 @@ def _promise(plant: dict[str, Any], width: int | None) -> list[Row]:
     promise = plant["promise"]
     if promise is None:
         return []
-    is_good = promise["kept"] and not promise["drifted"]
-    named = {"promise": Cell(promise["text"], "" if is_good else ATTENTION)}
+    is_good = promise.kept and not promise.drifted
+    named = {"promise": Cell(promise.text, "" if is_good else ATTENTION)}
     if plant["power"]:
         named["seen in an hour"] = Cell(describe_power(plant["power"]), FAINT)
     room = None if width is None else width - _INDENT - max(map(len, named)) - GAP

@@ -1,8 +1,8 @@
 """`up`: run the router in this process and the nodes as processes, until stopped."""
 
 import contextlib
+import time
 from collections.abc import Iterator, Sequence
-from datetime import UTC, datetime
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -29,14 +29,14 @@ from reactorwatch.cli.processes import (
     write_node_settings,
     write_settings,
 )
-from reactorwatch.description.find import DEFAULT_PROCESS, find_process
+from reactorwatch.description.read import DEFAULT_PROCESS, find_process
 from reactorwatch.diagnosis.practical_significance import check_tolerance
 from reactorwatch.errors import InputError
 from reactorwatch.limits import limits
 from reactorwatch.records.write import check_folder_name, make_folder
 from reactorwatch.runtime.config import BusConfig, LogConfig, MetricsConfig, read_settings, section
 from reactorwatch.runtime.event_loop import stop_on_signals
-from reactorwatch.runtime.logs import configure
+from reactorwatch.runtime.node_main import configure_log
 from recorder.config import RecorderConfig
 from recorder.keep import ENDING
 from recorder.recording_files import file_names
@@ -55,7 +55,7 @@ def run_until_stopped(
     """Run everything until SIGINT, SIGTERM or SIGHUP, or until a node ends by itself."""
     tables = read_settings(target.config)
     log_config = section(LogConfig, "log", tables, {})
-    configure(as_json=log_config.format == "json")
+    configure_log(as_json=log_config.format == "json")
     source = load_source(tables, flags, played)
     monitor = section(MonitorConfig, "monitor", tables, source.monitor_flags(tables))
     if isinstance(source.settings, PlantConfig):
@@ -136,7 +136,7 @@ def _write_settings(
     """Write the settings beside the recordings, under the same name; returns each node's file."""
     out = Path(recorder.out)
     make_folder(out.parent if out.suffix == ENDING and not out.is_dir() else out, "--out")
-    recording = file_names(recorder).first(datetime.now(UTC))
+    recording = file_names(recorder).next(time.time_ns())
     if recording.exists():
         raise InputError(f"--out {out}: a recording of that name exists; choose another name, or a folder")
     recorder = msgspec.structs.replace(recorder, about={**about, **recorder.about})

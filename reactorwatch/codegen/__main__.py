@@ -5,9 +5,9 @@ from reactorwatch.cli.main import run_command
 
 def _run() -> int:
     from reactorwatch.cli.kernels import compile_kernels  # imports NumPy, which `run_command` prepares
-    from reactorwatch.runtime.logs import configure
+    from reactorwatch.runtime.node_main import configure_log
 
-    configure()
+    configure_log()
     compile_kernels()
     return 0
 

@@ -8,26 +8,36 @@ most functions run for. No operation is left out, moved or fused, so the results
 
 Independent rows are taken four at a time, and so are four chains of rows (see `llvm_ir`): two to three times faster
 again.
+
+`ArrayFunction` calls one function for one row without converting its arguments and results, which takes a hundred times
+as long as the arithmetic of a small one.
+
+Machine code is kept on disk for all processes of a user: a diagnosis fits some sixty models, and compiling them takes a
+fifth of its time. An entry is named by a digest of the function, the compiler and the processor, so it is never wrong,
+only no longer requested. Where the folder cannot be written to, every process compiles for itself.
 """
 
 import ctypes
 import hashlib
+import os
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from ctypes.util import find_library
 from dataclasses import replace
 from functools import cache, cached_property
+from pathlib import Path
 from typing import Any, TypeAlias, cast
 
 import casadi as ca
 import llvmlite.binding as llvm
 import numpy as np
+import platformdirs
 
 from reactorwatch.arrays import Array
-from reactorwatch.codegen.cache import user_cache
 from reactorwatch.codegen.llvm_ir import CHAINED, IR_VERSION, PER_ROW, SHARED, RowLoop, check, write_ir
 
 LANES = 4
-"""Number of rows, or chains of rows, in one vector operation."""
+"""Number of rows, or chains of rows, in one vector operation: four doubles are the 256 bits of AVX2."""
 
 _Call: TypeAlias = Callable[..., int]
 
@@ -177,7 +187,7 @@ class _Host:
             llvm.load_library_permanently(find_library("m"))
         self._triple = llvm.get_process_triple()
         self._cpu, self._features = llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten()
-        self._cache = user_cache()
+        self._cache = CodeCache(platformdirs.user_cache_path("reactorwatch") / "machine_code")
 
     def load(self, function: ca.Function, loop: RowLoop) -> llvm.ExecutionEngine:
         """Engine with the machine code of a function, from the cache if it was compiled before."""
@@ -199,3 +209,97 @@ class _Host:
 def _host() -> _Host:
     """The compiler of this process."""
     return _Host()
+
+
+class ArrayFunction:
+    """Fill `arguments`, call, read `results`; the next call overwrites them.
+
+    CasADi keeps a matrix column by column, so its column is a row of the array: a matrix of shape (n, m) is an array
+    of shape (m, n), and a vector of n an array of shape (1, n).
+
+    Args:
+        function: the CasADi function; its results are made dense.
+
+    Attributes:
+        arguments: one array for each argument.
+        results: one array for each result.
+    """
+
+    def __init__(self, function: ca.Function) -> None:
+        symbols = function.mx_in()
+        if not all(function.sparsity_out(index).is_dense() for index in range(function.n_out())):
+            function = ca.Function(function.name(), symbols, [ca.densify(item) for item in function.call(symbols)])
+        self.arguments: tuple[Array, ...] = tuple(
+            np.zeros(function.size_in(index)[::-1]) for index in range(function.n_in())
+        )
+        self.results: tuple[Array, ...] = tuple(
+            np.zeros(function.size_out(index)[::-1]) for index in range(function.n_out())
+        )
+        self._buffer, self._evaluate = function.buffer()
+        for index, array in enumerate(self.arguments):
+            self._buffer.set_arg(index, memoryview(array))  # type: ignore[call-arg,arg-type] # the stub asks for a size
+        for index, array in enumerate(self.results):
+            self._buffer.set_res(index, memoryview(array))  # type: ignore[call-arg,arg-type] # as above
+
+    def __call__(self) -> None:
+        """Evaluate."""
+        self._evaluate()
+
+    def call(self, *values: Array | float) -> list[Array]:
+        """Evaluate with these arguments; returns copies of the results."""
+        for argument, value in zip(self.arguments, values, strict=True):
+            argument[:] = value
+        self._evaluate()
+        return [item.copy() for item in self.results]
+
+
+_DIGEST_BYTES = hashlib.sha256().digest_size
+
+
+class CodeCache:
+    """A folder of machine code.
+
+    Args:
+        folder: folder of the entries; made with the first one.
+        capacity: largest number of entries, of some 30 kB each.
+        evicted: number of the oldest entries that are evicted when there are more.
+    """
+
+    def __init__(self, folder: Path, capacity: int = 4000, evicted: int = 1000) -> None:
+        self._folder, self._capacity, self._evicted = folder, capacity, evicted
+
+    def get_or_make(self, name: str, make: Callable[[], bytes]) -> bytes:
+        """Return the entry of a name; make and store it if it is missing or damaged.
+
+        Args:
+            name: a digest of everything that the code depends on.
+            make: compiles the code.
+        """
+        path = self._folder / name
+        try:
+            entry = path.read_bytes()
+        except OSError:  # missing or unreadable
+            entry = b""
+        digest, code = entry[:_DIGEST_BYTES], entry[_DIGEST_BYTES:]
+        if digest != hashlib.sha256(code).digest():
+            code = make()
+            self._store(path, code)
+        return code
+
+    def _store(self, path: Path, code: bytes) -> None:
+        """Write to a temporary file and rename it, as other processes read and write at the same time."""
+        temporary = path.with_name(f"{path.name}.{os.getpid()}")
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True)
+            temporary.write_bytes(hashlib.sha256(code).digest() + code)
+            temporary.replace(path)
+            self._evict()
+        except OSError:  # the disk is full or not writable: the code is compiled again next time
+            with suppress(OSError):
+                temporary.unlink()
+
+    def _evict(self) -> None:
+        entries = [item for item in os.scandir(self._folder) if item.is_file()]
+        if len(entries) > self._capacity:
+            for item in sorted(entries, key=lambda item: item.stat().st_mtime_ns)[: self._evicted]:
+                Path(item.path).unlink(missing_ok=True)

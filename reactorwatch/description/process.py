@@ -11,10 +11,10 @@ import msgspec
 from reactorwatch.errors import InputError, describe_exception, describe_unknown, prefix_errors
 from reactorwatch.process import OPERATIONS, own_effects
 from reactorwatch.process.effect import Effect
+from reactorwatch.process.extended_model import store_equations
 from reactorwatch.process.generic import add_generic, generic_effects
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.operation import Operation, WatchDefaults
-from reactorwatch.process.stored_equations import store_equations
 from reactorwatch.records.file_format import FileFormat
 from reactorwatch.units import conversion
 

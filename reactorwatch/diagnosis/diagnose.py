@@ -7,26 +7,30 @@ from math import inf
 import numpy as np
 
 from reactorwatch.arrays import Array
-from reactorwatch.diagnosis.curves import curves_of, differences_of
 from reactorwatch.diagnosis.estimates import (
     adjusted_parameters,
     causes_of,
     convert_to_run_minutes,
     covariances_of,
+    extended_model,
     refine_parameters,
 )
-from reactorwatch.diagnosis.experiment.constraints import check_limits
 from reactorwatch.diagnosis.experiment.design import propose_experiment
-from reactorwatch.diagnosis.extended import extended_model
-from reactorwatch.diagnosis.fitting.colored_noise import Noise
-from reactorwatch.diagnosis.high_frequency_noise import estimate_sensor_noise
+from reactorwatch.diagnosis.experiment.inputs import check_limits
+from reactorwatch.diagnosis.fitting.colored_noise import Noise, estimate_sensor_noise
+from reactorwatch.diagnosis.fitting.hypothesis import FROM_BEGINNING
 from reactorwatch.diagnosis.holdout import Errors, evaluate_holdout, is_near_noise
-from reactorwatch.diagnosis.integration_error import looks_like_integration
 from reactorwatch.diagnosis.lasting import LastingResult, prefer_lasting
 from reactorwatch.diagnosis.law.describe import describe_law, law_hypothesis
-from reactorwatch.diagnosis.law.localise import NOISY_SHARE, Localised, UnknownSearch
+from reactorwatch.diagnosis.law.unknown import NOISY_SHARE, Localised, UnknownSearch
 from reactorwatch.diagnosis.parameter_priors import add_priors
-from reactorwatch.diagnosis.practical_significance import exceeds_tolerance, residual_exceeds_tolerance, tolerances_of
+from reactorwatch.diagnosis.practical_significance import (
+    curves_of,
+    differences_of,
+    exceeds_tolerance,
+    residual_exceeds_tolerance,
+    tolerances_of,
+)
 from reactorwatch.diagnosis.record_checks import make_run
 from reactorwatch.diagnosis.result import (
     AMBIGUOUS,
@@ -34,19 +38,19 @@ from reactorwatch.diagnosis.result import (
     NAMED,
     NOMINAL,
     UNKNOWN,
+    Adequacy,
     Alternative,
     Curves,
     Diagnosis,
     Gain,
     HeldOut,
+    LocationEvidence,
 )
 from reactorwatch.diagnosis.run import Run
-from reactorwatch.diagnosis.search.cause_prior import FROM_BEGINNING
-from reactorwatch.diagnosis.search.noise_growth import search_noise_growth
-from reactorwatch.diagnosis.search.noise_masking import search_single_cause
+from reactorwatch.diagnosis.search.noise import search_noise_growth, search_single_cause
 from reactorwatch.diagnosis.search.pairs import search_pairs
 from reactorwatch.diagnosis.search.search import FittedHypothesis, Search, SearchResult, smallest_noise
-from reactorwatch.diagnosis.whiteness import DOUBTFUL, WHITE, minus_log10_p
+from reactorwatch.diagnosis.whiteness import DOUBTFUL, WHITE, looks_like_integration, minus_log10_p
 from reactorwatch.process import effects_of
 from reactorwatch.process.effect import TIMING, Effect
 from reactorwatch.process.generic import hidden_sources
@@ -190,26 +194,30 @@ def diagnose(
         if reported is None or unknown is None
         else describe_law(adjusted, run, unknown.found, reported, covariances, gain.held_out)
     )
+    worse = _locations(best, alternatives) if unknown is None else unknown.locations
     return Diagnosis(
+        file=record.name,
+        zero=record.zero,
         samples=run.time_min.size,
+        runs=len(record.run_starts),
         span_min=record.span_min,
+        seconds=0.0,
         verdict=verdict,
         causes=causes,
         alternatives=tuple(_alternative(search, item, result.noise, best.bic, record) for item in alternatives),
-        location=location,
+        location=location or None,
+        locations=tuple(LocationEvidence(name, bic) for name, bic in worse.items()),
+        law=described,
         significant=verdict != NOMINAL,
-        practical=unexplained or exceeds_tolerance(curves, bands, blind),
-        differences=differences_of(model, noise_sd, curves),
+        practical=bool(unexplained or exceeds_tolerance(curves, bands, blind)),
         gain=gain,
-        adequacy=dict(zip(model.output_names, adequacy.tolist(), strict=True)),
+        adequacy={name: Adequacy(item) for name, item in zip(model.output_names, adequacy.tolist(), strict=True)},
         experiment=experiment,
         extended_model=extended_model(adjusted, effects, causes, record.zero_ns, reported),
-        remarks=tuple(remarks),
         parameters=parameters,
+        differences=differences_of(model, noise_sd, curves),
+        remarks=tuple(remarks),
         curves=curves,
-        runs=len(record.run_starts),
-        locations=_locations(best, alternatives) if unknown is None else unknown.locations,
-        law=described,
     )
 
 

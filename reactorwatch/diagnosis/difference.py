@@ -6,11 +6,13 @@ measured ones would sort errors by their own size.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from typing import ClassVar
 
+import msgspec
 import numpy as np
 
 from reactorwatch.arrays import Array
+from reactorwatch.results.base import Result
 
 BINS, LEAST_ROWS = 8, 20
 """Number of ranges along each axis, and minimum number of rows in one."""
@@ -18,49 +20,46 @@ BINS, LEAST_ROWS = 8, 20
 TIME = "time"
 
 
-@dataclass(frozen=True)
-class Range:
+class Range(Result, frozen=True):
     """Part of an axis.
 
     Attributes:
-        lower: lower end, in the axis's unit.
-        upper: upper end.
+        lower: lower end, in the axis's unit; `from` in JSON.
+        upper: upper end; `to` in JSON.
         mean: mean error, measured minus simulated.
         rmse: root mean square error.
         rows: number of rows in the range.
     """
 
-    lower: float
-    upper: float
+    lower: float = msgspec.field(name="from")
+    upper: float = msgspec.field(name="to")
     mean: float
     rmse: float
     rows: int
 
 
-@dataclass(frozen=True)
-class Difference:
+class Difference(Result, frozen=True):
     """Difference in one output.
 
     Attributes:
         rmse: root mean square error of the nominal simulation over the record; NaN if it diverged.
         noise_sd: standard deviation of the sensor's noise.
+        noise_share: share of noise in the mean square error.
         one_step: root mean square of the nominal filter's innovations, in predicted standard deviations.
+        unit: unit of the errors.
         along: ranges by axis: time in min, then inputs and outputs in their units; empty if the simulation diverged.
         units: units of the axes.
-        unit: unit of the errors.
     """
 
     rmse: float
     noise_sd: float
+    noise_share: float
     one_step: float
+    unit: str
     along: dict[str, tuple[Range, ...]]
     units: dict[str, str]
-    unit: str
 
-    @property
-    def noise_share(self) -> float:
-        """Share of noise in the mean square error."""
-        return min((self.noise_sd / self.rmse) ** 2, 1.0) if self.rmse > 0.0 else 1.0
+    python_only: ClassVar = ("units",)
 
     def worst(self, axis: str) -> Range | None:
         """Range of an axis with the largest error; None if it has none."""
@@ -91,7 +90,9 @@ def compute_difference(
         finite = values[np.isfinite(values)]
         shares = np.linspace(0.0, 1.0, BINS + 1)
         along[name] = _ranges(error, values, np.unique(np.quantile(finite, shares))) if finite.size else ()
-    return Difference(_rms(error), noise_sd, _rms(innovations), along, units, unit)
+    rmse = _rms(error)
+    noise_share = min((noise_sd / rmse) ** 2, 1.0) if rmse > 0.0 else 1.0
+    return Difference(rmse, noise_sd, noise_share, _rms(innovations), unit, along, units)
 
 
 def _ranges(error: Array, values: Array, edges: Array) -> tuple[Range, ...]:

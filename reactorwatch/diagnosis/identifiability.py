@@ -25,7 +25,7 @@ from reactorwatch.diagnosis.fitting.hypothesis import Fit, Hypothesis
 from reactorwatch.diagnosis.fitting.profiles import Constant
 from reactorwatch.diagnosis.result import LISTED
 from reactorwatch.diagnosis.run import Run
-from reactorwatch.diagnosis.search.noise_growth import LEAST_GAIN
+from reactorwatch.diagnosis.search.noise import LEAST_GAIN
 from reactorwatch.diagnosis.search.search import Search, smallest_noise
 from reactorwatch.process.effect import Effect, SensorEffect
 from reactorwatch.process.model import ProcessModel

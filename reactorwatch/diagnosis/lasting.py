@@ -17,11 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reactorwatch.arrays import Array
-from reactorwatch.diagnosis.fitting.bounded_least_squares import solve_bounded
 from reactorwatch.diagnosis.fitting.colored_noise import Noise
 from reactorwatch.diagnosis.fitting.fault_filter import FaultFilter, FilterEvaluation
 from reactorwatch.diagnosis.fitting.hypothesis import Hypothesis
 from reactorwatch.diagnosis.fitting.profiles import Constant
+from reactorwatch.diagnosis.fitting.signatures import solve_bounded
 from reactorwatch.diagnosis.fitting.simulation import FittedSimulation
 from reactorwatch.diagnosis.holdout import evaluate_holdout, holdout_rows, is_near_noise, rms
 from reactorwatch.diagnosis.run import Run

@@ -1,14 +1,16 @@
-"""Result of a diagnosis."""
+"""Result of a diagnosis: its fields are those of `diagnose --json`, but for what only texts and figures need."""
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from reactorwatch.arrays import Array
 from reactorwatch.diagnosis.difference import Difference
 from reactorwatch.process.law import ExtendedLaw
+from reactorwatch.results.base import Result
 
 NOMINAL, NAMED, AMBIGUOUS, UNKNOWN = "nominal", "named", "ambiguous", "unknown"
 
@@ -19,17 +21,20 @@ LISTED = 10.0
 """Threshold in BIC: alternatives that are worse by less are listed."""
 
 
-@dataclass(frozen=True)
-class Estimate:
+class Estimate(Result, frozen=True):
     """A number with its standard deviation, in a unit."""
 
     value: float
     sd: float
     unit: str
 
+    @property
+    def half_width(self) -> float:
+        """Half width of the 95 % interval."""
+        return SD_95 * self.sd
 
-@dataclass(frozen=True)
-class Cause:
+
+class Cause(Result, frozen=True, kw_only=True):
     """A cause that is part of an explanation.
 
     Attributes:
@@ -37,8 +42,8 @@ class Cause:
         profile: name of its profile in time.
         label: label for users.
         location: location where it acts.
-        parameters: `size` first, then those of the profile; times in minutes of the run in which it sets in.
-        run: number of that run in the record, from 1.
+        run: number of the run of the record in which it sets in, from 1; None: the record has one.
+        parameters: `size` first, then those of the profile; times in minutes of that run.
         run_shift_min: shift from minutes of that run to `Record.continuous_min`.
     """
 
@@ -46,41 +51,55 @@ class Cause:
     profile: str
     label: str
     location: str
+    run: int | None = None
     parameters: dict[str, Estimate]
-    run: int = 1
     run_shift_min: float = 0.0
 
+    python_only: ClassVar = ("run_shift_min",)
 
-@dataclass(frozen=True)
-class AdjustedParameter:
-    """An uncertain parameter with its estimate.
+
+class AdjustedParameter(Result, frozen=True):
+    """An uncertain parameter with its estimate, the posterior of prior and record.
 
     Attributes:
         nominal: value of the parameter in the nominal model.
         stated_sd: standard deviation of its prior.
-        estimate: posterior of prior and record.
+        value: value of the estimate.
+        sd: standard deviation of the estimate.
+        unit: unit of all of them.
     """
 
     nominal: float
     stated_sd: float
-    estimate: Estimate
+    value: float
+    sd: float
+    unit: str
+
+    @property
+    def prior(self) -> Estimate:
+        """The prior."""
+        return Estimate(self.nominal, self.stated_sd, self.unit)
+
+    @property
+    def estimate(self) -> Estimate:
+        """The posterior."""
+        return Estimate(self.value, self.sd, self.unit)
 
     @property
     def differs(self) -> bool:
         """True if the nominal value is outside the 95 % interval."""
-        return abs(self.estimate.value - self.nominal) > SD_95 * self.estimate.sd
+        return abs(self.value - self.nominal) > self.estimate.half_width
 
 
-@dataclass(frozen=True)
-class Alternative:
+class Alternative(Result, frozen=True):
     """An alternative explanation.
 
     Attributes:
-        explanation: causes of the alternative.
+        explanation: causes of the alternative; `causes` in JSON.
         delta_bic: BIC of the alternative minus that of the named explanation.
     """
 
-    explanation: tuple[Cause, ...]
+    explanation: tuple[Cause, ...] = msgspec.field(name="causes")
     delta_bic: float
 
     @property
@@ -89,8 +108,14 @@ class Alternative:
         return tuple((item.cause, item.profile) for item in self.explanation)
 
 
-@dataclass(frozen=True)
-class HeldOut:
+class LocationEvidence(Result, frozen=True):
+    """BIC of a location over that of the best."""
+
+    location: str
+    delta_bic: float
+
+
+class HeldOut(Result, frozen=True):
     """Errors of one output on rows that were not fitted, in its unit.
 
     Attributes:
@@ -109,9 +134,10 @@ class HeldOut:
     noise_sd: float
     unit: str
 
+    python_only: ClassVar = ("one_step_before", "one_step_after")
 
-@dataclass(frozen=True)
-class Gain:
+
+class Gain(Result, frozen=True):
     """Gain of the extended model.
 
     Attributes:
@@ -123,18 +149,23 @@ class Gain:
     held_out: dict[str, HeldOut]
 
 
-@dataclass(frozen=True)
-class Separation:
+class Adequacy(Result, frozen=True):
+    """Whiteness of the innovations of an output: minus the decimal logarithm of its p-value."""
+
+    minus_log10_p: float
+
+
+class Separation(Result, frozen=True):
     """Separation of two explanations by an experiment.
 
     Attributes:
         between: names of the explanations, the causes of each joined by a plus.
-        expected_delta_bic: expected BIC of the wrong one minus that of the true one.
+        expected_delta_bic: expected BIC of the wrong one minus that of the true one; `delta_bic` in JSON.
         probability: probability that this difference exceeds `LISTED`.
     """
 
     between: tuple[str, str]
-    expected_delta_bic: float
+    expected_delta_bic: float = msgspec.field(name="delta_bic")
     probability: float
 
 
@@ -153,20 +184,19 @@ class ExperimentCurves:
     outputs: dict[str, dict[str, Array]]
 
 
-@dataclass(frozen=True)
-class Experiment:
+class Experiment(Result, frozen=True, kw_only=True):
     """An input that separates alternatives.
 
     Attributes:
         why: the expected result, in a sentence.
         input: (minute, value) of each change.
         separates: explanations that it separates, each its causes joined by a plus.
-        expected_delta_bic: expected difference in BIC between the two nearest of them.
-        probability: probability that this difference exceeds `LISTED`.
         signal: input that is moved; the others stay constant.
         span_min: duration.
+        expected_delta_bic: expected difference in BIC between the two nearest of them.
+        probability: probability that this difference exceeds `LISTED`.
         limits: limits by signal that it keeps under every explanation.
-        separations: separation of every pair of explanations.
+        separations: separation of every pair of explanations; `expected` in JSON.
         predicted: lowest and highest noise-free value, by explanation and output.
         curves: curves for figures.
     """
@@ -174,14 +204,16 @@ class Experiment:
     why: str
     input: tuple[tuple[float, float], ...]
     separates: tuple[str, ...]
-    expected_delta_bic: float
-    probability: float
     signal: str
     span_min: float
+    expected_delta_bic: float
+    probability: float
     limits: dict[str, tuple[float, float]]
-    separations: tuple[Separation, ...]
+    separations: tuple[Separation, ...] = msgspec.field(name="expected")
     predicted: dict[str, dict[str, tuple[float, float]]]
-    curves: ExperimentCurves | None = field(default=None, repr=False, compare=False)
+    curves: ExperimentCurves | None = None
+
+    python_only: ClassVar = ("curves",)
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,8 +252,7 @@ class LawCurve:
     formula: Array
 
 
-@dataclass(frozen=True)
-class RivalLaw:
+class RivalLaw(Result, frozen=True):
     """A formula that the record cannot tell from the law, worse by `delta_bic`."""
 
     location: str
@@ -230,8 +261,19 @@ class RivalLaw:
     delta_bic: float
 
 
-@dataclass(frozen=True)
-class Law:
+class Correlation(Result, frozen=True):
+    """Correlation with an estimate, if a parameter of the model were uncertain.
+
+    Attributes:
+        parameter: name of the parameter.
+        correlation: the correlation.
+    """
+
+    parameter: str
+    correlation: float
+
+
+class Law(Result, frozen=True, kw_only=True):
     """Law of an unknown: the missing term as a formula.
 
     Attributes:
@@ -246,7 +288,7 @@ class Law:
         range: smallest and largest value of each variable with which it was seen.
         held_out: errors on held-out rows, by output.
         correlations: for each parameter, the model's parameter with which its estimate would be correlated most if
-            that were uncertain, and the correlation.
+            that were uncertain.
         extended: law for the extended model.
         curves: curves for figures, one for each variable.
     """
@@ -261,9 +303,11 @@ class Law:
     rivals: tuple[RivalLaw, ...]
     range: dict[str, tuple[float, float]]
     held_out: dict[str, HeldOut]
-    correlations: dict[str, tuple[str, float]]
-    extended: ExtendedLaw = field(repr=False)
-    curves: tuple[LawCurve, ...] = field(default=(), repr=False, compare=False)
+    correlations: dict[str, Correlation]
+    extended: ExtendedLaw
+    curves: tuple[LawCurve, ...] = ()
+
+    python_only: ClassVar = ("extended", "curves")
 
 
 @dataclass(frozen=True, eq=False)
@@ -297,51 +341,58 @@ class Curves:
     held_out: dict[str, NDArray[np.bool_]] = field(default_factory=dict)
 
 
-@dataclass(frozen=True)
-class Diagnosis:
+class Diagnosis(Result, frozen=True, kw_only=True):
     """Result of a diagnosis.
 
     Attributes:
+        file: name of the record.
+        zero: clock time from which the minutes count, ISO 8601; None: unknown.
         samples: number of rows of the record.
+        runs: number of runs in the record.
         span_min: duration from its first row to its last, summed over its runs.
+        seconds: duration of the diagnosis; 0: not measured.
         verdict: `nominal`, `named`, `ambiguous` or `unknown`.
         causes: causes that explain the record together; empty if nominal or unknown.
         alternatives: every other explanation within 10 BIC, the best first.
-        location: location of the deviation; empty if nominal.
-        significant: true if the nominal model is refuted statistically.
-        practical: true if the difference exceeds the user's tolerance.
-        differences: differences between simulation and record, by output.
-        gain: gain of the extended model.
-        adequacy: minus the decimal logarithm of the p-value that the innovations are white, by output.
-        experiment: experiment that would separate the alternatives; None if there is none.
-        extended_model: extended model as in its file (`diagnosis.extended_model`).
-        remarks: further remarks, in sentences.
-        parameters: uncertain parameters, by name.
-        curves: curves for figures; with several runs, over `Record.continuous_min`.
-        runs: number of runs in the record.
+        location: location of the deviation; None if nominal.
         locations: BIC of each location within `LISTED` over that of the best; empty where causes explain the record.
         law: law of an unknown; None without one.
+        significant: true if the nominal model is refuted statistically.
+        practical: true if the difference exceeds the user's tolerance.
+        gain: gain of the extended model.
+        adequacy: whiteness of the innovations, by output.
+        experiment: experiment that would separate the alternatives; None if there is none.
+        extended_model: extended model as in its file (`diagnosis.extended_model`).
+        parameters: uncertain parameters, by name.
+        differences: differences between simulation and record, by output; in JSON only in a report.
+        remarks: further remarks, in sentences.
+        curves: curves for figures; with several runs, over `Record.continuous_min`.
     """
 
+    file: str
+    zero: str | None
     samples: int
+    runs: int
     span_min: float
+    seconds: float
     verdict: str
     causes: tuple[Cause, ...]
     alternatives: tuple[Alternative, ...]
-    location: str
+    location: str | None
+    locations: tuple[LocationEvidence, ...]
+    law: Law | None
     significant: bool
     practical: bool
-    differences: dict[str, Difference]
     gain: Gain
-    adequacy: dict[str, float]
+    adequacy: dict[str, Adequacy]
     experiment: Experiment | None
     extended_model: dict[str, Any]
+    parameters: dict[str, AdjustedParameter] = msgspec.field(default_factory=dict)
+    differences: dict[str, Difference]
     remarks: tuple[str, ...] = ()
-    parameters: dict[str, AdjustedParameter] = field(default_factory=dict)
-    curves: Curves | None = field(default=None, repr=False, compare=False)
-    runs: int = 1
-    locations: dict[str, float] = field(default_factory=dict)
-    law: Law | None = None
+    curves: Curves | None = None
+
+    python_only: ClassVar = ("differences", "remarks", "curves")
 
     @property
     def is_extended(self) -> bool:

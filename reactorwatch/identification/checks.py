@@ -38,7 +38,7 @@ from reactorwatch.identification.structure import Structure, as_columns
 LARGEST_CONDITION = 1e4  # of the scaled regressors: four digits are lost
 SLOWEST_SAMPLES, BEST_SAMPLES, FASTEST_SAMPLES = 3.0, 10.0, 30.0  # T95: about twice beyond what is advised is accepted
 LEAST_AMPLITUDE = 3.0  # of the output, in standard deviations of its noise
-DEFAULT_LAGS = 20
+DEFAULT_LAGS = 20  # of residual tests; a model of many parameters needs more
 
 
 class Check(msgspec.Struct, frozen=True):

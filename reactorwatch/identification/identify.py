@@ -4,11 +4,9 @@ import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, get_args
+from typing import Any, ClassVar, get_args
 
-import msgspec
 import numpy as np
-from msgspec import UNSET, UnsetType
 
 from reactorwatch.arrays import Array
 from reactorwatch.errors import InputError, UnfitRecordError, describe_unknown
@@ -20,6 +18,7 @@ from reactorwatch.identification.linear_model import Kind, LinearModel, fit_perc
 from reactorwatch.identification.polynomial import PolynomialModel, fit_narx, fit_noe, name_product
 from reactorwatch.identification.rls import RecursiveLeastSquares
 from reactorwatch.identification.structure import Scaling, Structure
+from reactorwatch.results.base import Result
 
 FittedModel = LinearModel | PolynomialModel
 
@@ -68,18 +67,18 @@ class ModelForm:
             raise InputError(f"forgetting is of a recursive model, got {self.forgetting:g}: add --recursive")
 
 
-class Deviations(msgspec.Struct, frozen=True):
+class Deviations(Result, frozen=True):
     """Standard deviations of the parameters; inf where the rows do not determine them."""
 
     a: Coefficients
     b: InputCoefficients
     offset: float
-    c: Coefficients | UnsetType = UNSET
-    d: Coefficients | UnsetType = UNSET
-    f: Coefficients | UnsetType = UNSET
+    c: Coefficients | None = None
+    d: Coefficients | None = None
+    f: Coefficients | None = None
 
 
-class Term(msgspec.Struct, frozen=True):
+class Term(Result, frozen=True):
     """A term of a polynomial.
 
     Attributes:
@@ -93,7 +92,7 @@ class Term(msgspec.Struct, frozen=True):
     sd: float
 
 
-class FitPercent(msgspec.Struct, frozen=True):
+class FitPercent(Result, frozen=True):
     """Fits on the held-out rows, 100 (1 - |y - yhat| / |y - mean y|).
 
     Attributes:
@@ -105,7 +104,7 @@ class FitPercent(msgspec.Struct, frozen=True):
     free_run: float
 
 
-class Rmse(msgspec.Struct, frozen=True):
+class Rmse(Result, frozen=True):
     """Root mean square errors on the held-out rows, in the unit of the output.
 
     Attributes:
@@ -117,7 +116,24 @@ class Rmse(msgspec.Struct, frozen=True):
     free_run: float
 
 
-class Identification(msgspec.Struct, frozen=True):
+@dataclass(frozen=True, eq=False)
+class HeldOutRun:
+    """A model on the held-out rows.
+
+    Attributes:
+        time: times of the rows, shape (rows,).
+        measured: the output, NaN where nothing was measured.
+        one_step: one-step-ahead prediction, NaN where there is none.
+        free: simulation, NaN where there is none, inf after it has diverged.
+    """
+
+    time: Array
+    measured: Array
+    one_step: Array
+    free: Array
+
+
+class Identification(Result, frozen=True):
     """A model and how good it is.
 
     y[k] = a1 y[k-1] + ... + an y[k-n] + b1 u[k-d] + ... + bn u[k-d-n+1] + offset, d the delay, in the signals' own
@@ -146,6 +162,7 @@ class Identification(msgspec.Struct, frozen=True):
         f: n coefficients of the plant's own past of a Box-Jenkins model.
         terms: terms of a polynomial model.
         rmse: errors on the held-out rows, where a record was given for validation or rows set the state.
+        run: the model on the held-out rows.
     """
 
     model: str
@@ -161,11 +178,14 @@ class Identification(msgspec.Struct, frozen=True):
     fit_percent: FitPercent
     whiteness_minus_log10_p: float
     checks: dict[str, str]
-    c: Coefficients | UnsetType = UNSET
-    d: Coefficients | UnsetType = UNSET
-    f: Coefficients | UnsetType = UNSET
-    terms: tuple[Term, ...] | UnsetType = UNSET
-    rmse: Rmse | UnsetType = UNSET
+    c: Coefficients | None = None
+    d: Coefficients | None = None
+    f: Coefficients | None = None
+    terms: tuple[Term, ...] | None = None
+    rmse: Rmse | None = None
+    run: HeldOutRun | None = None
+
+    python_only: ClassVar = ("run",)
 
     @property
     def fit(self) -> FitPercent:
@@ -173,34 +193,10 @@ class Identification(msgspec.Struct, frozen=True):
         return self.fit_percent
 
 
-@dataclass(frozen=True, eq=False)
-class HeldOutRun:
-    """A model on the held-out rows.
-
-    Attributes:
-        time: times of the rows, shape (rows,).
-        measured: the output, NaN where nothing was measured.
-        one_step: one-step-ahead prediction, NaN where there is none.
-        free: simulation, NaN where there is none, inf after it has diverged.
-    """
-
-    time: Array
-    measured: Array
-    one_step: Array
-    free: Array
-
-
 def identify(
     data: Dataset, form: ModelForm | None = None, validation: Dataset | None = None, settle: int = 0
 ) -> Identification:
-    """Fit a model and validate it; see `identify_and_run`."""
-    return identify_and_run(data, form, validation, settle)[0]
-
-
-def identify_and_run(
-    data: Dataset, form: ModelForm | None = None, validation: Dataset | None = None, settle: int = 0
-) -> tuple[Identification, HeldOutRun]:
-    """Fit a model to the first half of a data set and validate it on the second; returns it with its run there.
+    """Fit a model to the first half of a data set and validate it on the second.
 
     Args:
         data: the rows.
@@ -237,7 +233,7 @@ def identify_and_run(
     predicted[:settle] = np.nan
     y = held_out.output[:, 0]
     values, deviations = _coefficients(model, data)
-    found = Identification(
+    return Identification(
         model=form.model,
         order=form.order,
         delay=form.delay,
@@ -248,10 +244,10 @@ def identify_and_run(
         fit_percent=FitPercent(fit_percent(y, predicted), fit_percent(y, run)),
         whiteness_minus_log10_p=white,
         checks=checks,
-        rmse=Rmse(_rmse(y, predicted), _rmse(y, run)) if validation is not None or settle else UNSET,
+        rmse=Rmse(_rmse(y, predicted), _rmse(y, run)) if validation is not None or settle else None,
+        run=HeldOutRun(held_out.time, y, predicted, run),
         **values,
     )
-    return found, HeldOutRun(held_out.time, y, predicted, run)
 
 
 def free_run(model: FittedModel, data: Dataset, settle: int = 0) -> Array:

@@ -36,9 +36,6 @@ from reactorwatch.identification.linear_model import standard_deviations
 from reactorwatch.identification.structure import Scaling, Structure, as_columns
 
 LARGEST_SIZE = 30  # number of terms of a NARX model beyond which no more are selected
-DIVERGED = 1e6  # a scaled output beyond this, a million times its spread, has diverged
-NARX_DEGREE = 2
-
 Product = tuple[int, ...]
 """Indices of the factors among the lagged signals, increasing; empty: the constant."""
 
@@ -163,14 +160,14 @@ def fit_narx(
     u, y = as_columns(inputs, "inputs", structure.inputs), as_columns(outputs, "outputs", 1)
     record = ScaledRecord.of(structure, u, y, time)
     rows = replace(record, structure=structure.without_offset()).enough_rows()
-    candidates = products_of(structure.without_offset().parameters, NARX_DEGREE)
+    candidates = products_of(structure.without_offset().parameters, 2)
     if rows.position.size < len(candidates):
         raise UnfitRecordError(
             f"the {len(candidates)} candidates for terms need as many complete rows, got {rows.position.size}; "
             "lower the order"
         )
     regressors, target = _multiply(rows.regressors, candidates), rows.outputs[:, 0]
-    linear = sum(len(product) < NARX_DEGREE for product in candidates)
+    linear = sum(len(product) < 2 for product in candidates)
     order = [*range(linear), *_select(regressors, target, linear)]
     sizes = range(linear, min(len(order), LARGEST_SIZE) + 1)
 
@@ -374,7 +371,7 @@ def run_polynomial(
                 if factors[term, position] >= 0:
                     product *= signals[factors[term, position]]
             total += product
-        if not abs(total) < DIVERGED:
+        if not abs(total) < 1e6:  # a million times its spread
             diverged, run[k] = True, np.inf
             continue
         own[k] = run[k] = total

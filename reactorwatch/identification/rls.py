@@ -58,18 +58,12 @@ from reactorwatch.codegen.numba_kernel import jit
 from reactorwatch.errors import InputError
 from reactorwatch.stored_state import Memory
 
-LARGEST_VALUE = 1e30  # regressors and outputs at or beyond this are refused
-
-# Where nothing is known beforehand, a pivot below this share of its column's sum of squares is rounding, not
-# information: a condition beyond 1e13. Where something is, every pivot carries on what is known of those before it.
-RANK_SHARE = 1e-26
-_LEAST_PIVOT = 1e-60  # a smaller one is no information, whatever its column; with LARGEST_VALUE all products are finite
+LARGEST_VALUE = 1e30  # regressors and outputs at or beyond this are refused: all products are then finite
 
 # The numbers of an estimator of n parameters: n each of theta, z (the rotated outputs), d (the diagonal), q (the
 # columns' sums of squares) and what z rounds away; then SQUARES to ROWS; then R's n(n-1)/2 entries above the diagonal,
 # by rows, and what they round away.
-SQUARES, WEIGHT, WEIGHT2, TURN, ROWS = range(5)
-SUMS = 5
+SQUARES, WEIGHT, WEIGHT2, TURN, ROWS, SUMS = range(6)
 
 
 @jit
@@ -90,7 +84,7 @@ def rotate(
         value, old = row[i], numbers[2 * n + i]
         weighted = weight * value
         new = old + weighted * value
-        informs = new > rank_share * numbers[3 * n + i] + _LEAST_PIVOT
+        informs = new > rank_share * numbers[3 * n + i] + 1e-60  # less is no information
         gain = weighted / new if informs else 0.0
         target, small = numbers[n + i], numbers[4 * n + i]
         rest = output - value * target - value * small
@@ -262,7 +256,9 @@ class RecursiveLeastSquares:
             raise ValueError(f"{memory.parameters} parameters must have {size} numbers, got {memory.numbers.size}")
         self.memory, self._parameters = memory, memory.parameters
         self._covariance_limit = memory.covariance_limit
-        self._rank_share = RANK_SHARE if math.isinf(self._covariance_limit) else 0.0
+        # Where nothing is known beforehand, a pivot below this share of its column's sum of squares is rounding, not
+        # information: a condition beyond 1e13. Where something is, every pivot carries on what is known before it.
+        self._rank_share = 1e-26 if math.isinf(self._covariance_limit) else 0.0
         self._set_forgetting(memory.forgetting)
         n, self._numbers, self._work = memory.parameters, memory.numbers, np.zeros(memory.parameters)
         self._diagonal, self._sums = self._numbers[2 * n : 3 * n], self._numbers[5 * n : 5 * n + SUMS]

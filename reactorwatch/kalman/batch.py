@@ -16,6 +16,7 @@ microsecond; other work counts as many units as it took rows' time when it was m
 """
 
 from collections.abc import Generator, Sequence
+from enum import IntEnum
 from math import inf, log, pi
 from typing import NamedTuple, TypeAlias
 
@@ -34,14 +35,18 @@ LONGEST_GAP_MIN = 30.0  # after more a filter restarts, see `ekf`
 
 LEAST_ROWS = 1000  # of a batch, for which compiling the lanes pays
 
-STEPS_PER_RUN = 100  # for the set-up and the results of a filter's run over a record of any length
-STEPS_PER_EVALUATION = 200  # for the signals and the layout of a hypothesis, besides its run and one for ten rows
-STEPS_PER_LINEARISATION = 300  # for a linearisation of a filter about its run, besides three for two rows
-STEPS_PER_COVARIANCE = 350  # for the covariance of a hypothesis's parameters
-STEPS_PER_ROW = 25  # for a row that is filtered by itself
-STEPS_PER_PREDICTION = 3  # for two integration steps before the last two of an interval
-STEPS_PER_START = 250  # for a start of the filter, which also stops the machine code
-STEPS_PER_SEARCH = 12_000  # for a search for steady states, where measurements do not determine the initial state
+
+class StepCost(IntEnum):
+    """Costs of other work than a row, in filter steps, as measured (see the module)."""
+
+    RUN = 100  # for the set-up and the results of a filter's run over a record of any length
+    EVALUATION = 200  # for the signals and the layout of a hypothesis, besides its run and one for ten rows
+    LINEARISATION = 300  # for a linearisation of a filter about its run, besides three for two rows
+    COVARIANCE = 350  # for the covariance of a hypothesis's parameters
+    ROW = 25  # for a row that is filtered by itself
+    PREDICTION = 3  # for two integration steps before the last two of an interval
+    START = 250  # for a start of the filter, which also stops the machine code
+    SEARCH = 12_000  # for a search for steady states, where measurements do not determine the initial state
 
 
 class BudgetExceededError(Exception):

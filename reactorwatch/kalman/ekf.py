@@ -40,22 +40,17 @@ import msgspec
 import numpy as np
 
 from reactorwatch.arrays import Array
-from reactorwatch.codegen.array_function import ArrayFunction
-from reactorwatch.codegen.compiled_function import CompiledFunction
+from reactorwatch.codegen.compiled_function import ArrayFunction, CompiledFunction
 from reactorwatch.kalman.batch import (
     LONGEST_GAP_MIN,
     LONGEST_ROW_MIN,
-    STEPS_PER_PREDICTION,
-    STEPS_PER_ROW,
-    STEPS_PER_RUN,
-    STEPS_PER_SEARCH,
-    STEPS_PER_START,
     BatchedRun,
     FilterRecord,
     FilterResult,
     Innovation,
     RowBatch,
     StepBudget,
+    StepCost,
     run_together,
 )
 from reactorwatch.kalman.ekf_step import NoiseLevels, compiled_row, fill_row, predict_function, row_function, variances
@@ -209,7 +204,7 @@ class Filter:
             BudgetExceededError: the budget is spent; also raised by `run` and `run_batched`.
         """
         n, before = self._n_y, self._time_min
-        self._spend(STEPS_PER_ROW)
+        self._spend(StepCost.ROW)
         if before is None or not 0.0 < time_min - before <= LONGEST_GAP_MIN:
             return self._start(time_min, inputs, measured)
         step = 0.5 * (time_min - before)
@@ -249,7 +244,7 @@ class Filter:
         else:
             self.state = start
         self._started = self._time_min is not None
-        self._spend(STEPS_PER_RUN)
+        self._spend(StepCost.RUN)
         rows, near = record.following(self._time_min, self._inputs, self._breaks)
         count, n, n_x = len(rows), self._n_y, self._n_x
         outputs, beliefs = np.empty((count, 5 * n + 1)), np.empty((count, self._belief.size))
@@ -325,7 +320,7 @@ class Filter:
     def _predict(self, belief: Array, inputs: Sequence[float], edges: Sequence[float]) -> Array:
         """State and covariance after some steps, taken two by two."""
         prediction = self._prediction
-        self._spend(STEPS_PER_PREDICTION * (len(edges) // 2))
+        self._spend(StepCost.PREDICTION * (len(edges) // 2))
         prediction.arguments[2][0] = self._constants
         for begin, middle, end in zip(edges[:-2:2], edges[1:-1:2], edges[2::2], strict=True):
             prediction.arguments[0][0] = belief
@@ -380,9 +375,9 @@ class Filter:
             return self._nothing
         searches = self._initial_state.searches
         found = self._initial_state.estimate(time_min, inputs, measured, self._noise.measurement_sd, self._changes)
-        self._spend(STEPS_PER_SEARCH * (self._initial_state.searches - searches))
+        self._spend(StepCost.SEARCH * (self._initial_state.searches - searches))
         if found is not None:
-            self._spend(STEPS_PER_START)
+            self._spend(StepCost.START)
             x, P = found
             if self._lasting and self._learned:  # estimates of constant states are kept
                 kept, n = self._lasting, self._n_x

@@ -26,7 +26,7 @@ from reactorwatch.codegen.numba_kernel import jit
 from reactorwatch.kalman.batch import LONGEST_ROW_MIN, InputUncertainty
 from reactorwatch.kalman.ekf_step import NoiseLevels, transition
 from reactorwatch.process.model import ProcessModel
-from reactorwatch.process.simulate import LONGEST_STEP_MIN
+from reactorwatch.process.simulate import LONGEST_STEP_MIN, compiled_outputs
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,7 +166,7 @@ class ErrorLinearization:
         p = self.model.values()
         predicted, F, G, spread = self._predict(x[:-1], inputs[:-1], time_min, p, uncertainty)
         H, D = self._code.outputs_by.map(x, inputs, p, time_min)
-        (y,) = self._code.outputs.map(x, inputs, p, time_min)
+        (y,) = compiled_outputs(self.model).map(x, inputs, p, time_min)
         sd = np.sqrt(np.diagonal(spread, axis1=1, axis2=2))
         return LinearizedTrajectory(predicted, F, G, sd, y[:, :, 0], H, D)
 
@@ -250,11 +250,6 @@ class _Code:
     def _noise(self) -> CompiledFunction | None:
         function = self.model.noise_function()
         return None if function is None else CompiledFunction(function, shared=[1])
-
-    @cached_property
-    def outputs(self) -> CompiledFunction:
-        x, u, p, t, y = self.model.output_expressions()
-        return CompiledFunction(ca.Function("outputs", [x, u, p, t], [y]), shared=[2])
 
 
 @jit

@@ -31,7 +31,7 @@ import casadi as ca
 import numpy as np
 
 from reactorwatch.arrays import Array
-from reactorwatch.codegen.array_function import ArrayFunction
+from reactorwatch.codegen.compiled_function import ArrayFunction
 from reactorwatch.kalman.ekf_step import output_function
 from reactorwatch.process import effects_of, named_effects
 from reactorwatch.process.effect import TIMING, Effect
@@ -42,9 +42,6 @@ from reactorwatch.process.steady_state import SteadyState, SteadyStates
 
 CONSTANT, WANDER, NOISE = "constant", "wander", "noise"
 """Kinds of additional states: `constant feed_temperature`, `wander T`, `noise T`."""
-
-MOST_CONSTANTS = 6  # of effects without states; the lags of the inputs come on top
-LEAST_RATE = 0.04  # rms rate that an effect must add to those selected before, in scales of the states a minute
 
 
 class InitialState:
@@ -268,10 +265,10 @@ def select_effects(model: ProcessModel, x: Array, u: Array) -> tuple[str, ...]:
             rows.append(rates)
     left = np.array(rows)
     selected: list[str] = []
-    while len(selected) < MOST_CONSTANTS and left.size:
+    while len(selected) < 6 and left.size:  # the lags of the inputs come on top
         sizes = np.linalg.norm(left, axis=1)
         best = int(np.argmax(sizes))
-        if sizes[best] < LEAST_RATE * np.sqrt(left.shape[1]):
+        if sizes[best] < 0.04 * np.sqrt(left.shape[1]):  # in scales a minute (rms)
             break
         selected.append(candidates[best])
         direction = left[best] / sizes[best]

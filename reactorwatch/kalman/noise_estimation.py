@@ -39,13 +39,8 @@ from reactorwatch.process.model import ProcessModel
 INITIAL_SHARES = (0.3, 0.03, 0.003)
 """Initial process noise, in scales of the state per square root of a minute; the noisiest converges best."""
 
-NO_NOISE, NEGLIGIBLE_NOISE = 1e-5, 3e-4  # in scales: as good as none, and one that is but from which steps can start
 CLIP = 4.0  # standard deviations beyond which the loss of a value is constant
 FIRST_ROWS = 300  # that the first steps of the search use
-LONGEST_STEP = 1.2  # of a logarithm: sizes change by at most a factor of 3.3
-DIFFERENCE = 0.01  # of a logarithm, for derivatives
-CONVERGED_GAIN = 0.2  # of log likelihood: less ends the search
-_MEDIAN_THIRD_DIFFERENCE = 0.6745 * sqrt(20.0)  # their median size, for white noise of unit variance
 _CUT_MEAN_SQUARE = erf(CLIP / sqrt(2)) - CLIP * sqrt(2 / pi) * exp(-(CLIP**2) / 2)  # of w where |w| < CLIP, else 0
 
 
@@ -147,7 +142,8 @@ class _NoiseSearch:
         largest = np.max(np.abs(np.nan_to_num(measured)), axis=0)
         smallest_sd = np.maximum(smallest_sd, 1e-9 * np.where(largest > 0.0, largest, 1.0))
         limits = np.log([[item.lower, item.upper] for item in self._learned]).reshape(-1, 2).T
-        self._lowest = np.concatenate([np.log(smallest_sd), np.log(NO_NOISE * self._scales), limits[0]])
+        # 1e-5 scales of process noise are as good as none.
+        self._lowest = np.concatenate([np.log(smallest_sd), np.log(1e-5 * self._scales), limits[0]])
         self._highest = np.concatenate([np.full(self._of_states.stop, inf), limits[1]])
         self._first = np.maximum([initial_sensor_sd(column) for column in measured.T], smallest_sd)
         first = NoiseLevels(tuple(self._first.tolist()), (0.0,) * len(model.states))
@@ -178,7 +174,8 @@ class _NoiseSearch:
     def _with_noise(self, levels: NoiseLevels) -> Array:
         """Theta of these levels, with noise in every state: no step leads out of none."""
         sensors = np.maximum(np.log(levels.measurement_sd), self._lowest[: self._n_y])
-        states = np.maximum(np.array(levels.process_sd)[self._states], NEGLIGIBLE_NOISE * self._scales)
+        # 3e-4 scales of noise are negligible, but steps can start from them.
+        states = np.maximum(np.array(levels.process_sd)[self._states], 3e-4 * self._scales)
         return np.concatenate([sensors, np.log(states), np.log([item.value for item in self._learned])])
 
     def _noisier_starts(self, theta: Array) -> list[Array]:
@@ -212,7 +209,7 @@ class _NoiseSearch:
             best, predicted = self._step(best, range(best.theta.size))
             gain = before - best.loss
             # A gain as predicted means that the loss is quadratic here, so the optimum is reached.
-            if gain < CONVERGED_GAIN or abs(gain - predicted) < 0.5 * CONVERGED_GAIN:
+            if gain < 0.2 or abs(gain - predicted) < 0.1:  # of log likelihood
                 break
         return best
 
@@ -235,9 +232,11 @@ class _NoiseSearch:
 
         Also returns the predicted gain, -inf for a shortened step, which predicts nothing about what is beyond.
         """
-        near = self._evaluate([best.theta + DIFFERENCE * (np.arange(best.theta.size) == index) for index in chosen])
-        of_w = np.stack([(trial.w - best.w) / DIFFERENCE for trial in near])
-        of_d = np.stack([(trial.d - best.d) / DIFFERENCE for trial in near])
+        largest = 1.2  # of a logarithm: sizes change by at most a factor of 3.3
+        small = 0.01  # of a logarithm, for derivatives
+        near = self._evaluate([best.theta + small * (np.arange(best.theta.size) == index) for index in chosen])
+        of_w = np.stack([(trial.w - best.w) / small for trial in near])
+        of_d = np.stack([(trial.d - best.d) / small for trial in near])
         counted = np.where(np.abs(best.w) < CLIP, 1.0 / _CUT_MEAN_SQUARE, 0.0)
         gradient = np.sum(of_d + of_w * best.w * counted, axis=(1, 2))
         of_w, of_d = (of_w * np.sqrt(counted)).reshape(len(chosen), -1), of_d.reshape(len(chosen), -1)
@@ -247,8 +246,8 @@ class _NoiseSearch:
         step = np.zeros(best.theta.size)
         step[chosen] = -np.linalg.solve(information + np.diag(1e-3 * np.diag(information) + 1.0), gradient)
         longest = float(np.max(np.abs(step)))
-        full = longest <= LONGEST_STEP
-        step *= min(1.0, LONGEST_STEP / max(longest, LONGEST_STEP))
+        full = longest <= largest
+        step *= min(1.0, largest / max(longest, largest))
         for _ in range(4):
             predicted = -float(step[chosen] @ (gradient + 0.5 * information @ step[chosen]))
             if predicted < 0.02:
@@ -306,7 +305,8 @@ def initial_sensor_sd(column: Array) -> float:
         column: measurements, shape (rows,); NaN where missing.
     """
     third = np.abs(np.diff(column[np.isfinite(column)], n=3))
-    return float(np.median(third)) / _MEDIAN_THIRD_DIFFERENCE if third.size else 0.0
+    # The median size of third differences of white noise of unit variance.
+    return float(np.median(third)) / (0.6745 * sqrt(20.0)) if third.size else 0.0
 
 
 def resolution(values: Array) -> float:

@@ -26,9 +26,6 @@ from reactorwatch.process.profiles import FREE_NAME, PROFILES, Profile, ProfileP
 
 EXAMPLE = "coolant_flow:step:-0.05@30min"
 
-MAX_KNOTS = 100
-"""Largest number of knots of a curve. Every step of the plant searches them."""
-
 _MINUTES = {"s": 1 / 60, "min": 1.0, "h": 60.0}
 _NUMBER = re.compile(r"([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*(.*)")
 
@@ -183,10 +180,8 @@ def _parse_curve(effect: Effect, size: float, assignments: list[str]) -> tuple[P
         if not effect.lower <= value <= effect.upper:
             raise InputError(f"size times share must be in {reach}, got {value:g} at {time:g} min")
         knots.append((time, share))
-    if not 2 <= len(knots) <= MAX_KNOTS:
-        raise InputError(
-            f"a curve must have 2 to {MAX_KNOTS} times with their shares, like ,0min=0,90min=1, got {len(knots)}"
-        )
+    if not 2 <= len(knots) <= 100:  # every step of the plant searches them
+        raise InputError(f"a curve must have 2 to 100 times with their shares, like ,0min=0,90min=1, got {len(knots)}")
     values = {"size": size}
     values |= {f"time_{number}": time for number, (time, _) in enumerate(knots, 1)}
     values |= {f"value_{number}": share for number, (_, share) in enumerate(knots, 1)}

@@ -40,27 +40,17 @@ from reactorwatch.process.signal_effects import (
 )
 from reactorwatch.units import absolute
 
-TIMES_MIN = (0.05, 0.3, 2.0, 10.0)
-"""Lags and delays from which fits start."""
+TIMES: dict[str, Any] = {"upper": 1000.0, "start_values": (0.05, 0.3, 2.0, 10.0)}
+"""Lags and delays in minutes: the largest, and those from which fits start, a factor of six apart."""
 
-LONGEST_MIN = 1000.0
-"""Largest lag and delay."""
-
-TYPICAL_SHARE, LARGEST_SHARE = 0.02, 4.0
-"""Deviation of a parameter, as a share of its value, that is worth finding; the largest that is fitted."""
+TYPICAL_SHARE = 0.02
+"""Deviation of a parameter, as a share of its value, that is worth finding."""
 
 TYPICAL_SCALES, LARGEST_SCALES = 0.1, 20.0
 """The same for a bias, an offset, and a source in a minute, in scales of their quantity."""
 
-STICTION_SCALES = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0)
-"""Thresholds of a sticking input that are tried, in scales of the input."""
-
-
-POINTS, SEED = 8, 1
-"""Points at which models are compared, drawn from a seed."""
-
-AGREEMENT = 1e-6
-"""Largest difference between the changes of twins, as a fraction of the change."""
+POINTS = 8
+"""Points at which models are compared: a factor that agrees at all of them by chance is out of the question."""
 
 
 class Source(Effect):
@@ -194,7 +184,7 @@ def _of_output(model: ProcessModel, output: Output, scale: float) -> list[Effect
     name, unit = output.name, output.unit
     at: dict[str, Any] = {"output": name, "location": name}
     reach, in_unit = LARGEST_SCALES * scale, "" if unit == "1" else f" {unit}"
-    times: dict[str, Any] = {**at, "scale": scale, "upper": LONGEST_MIN, "start_values": TIMES_MIN}
+    times: dict[str, Any] = {**at, "scale": scale, **TIMES}
     usual = model.function()(*reference_point(model), model.values(), 0.0, 0.0)[1]
     middle = float(usual[model.output_names.index(name)])
     stuck_at = EffectConstant("value", middle, reach, unit, middle - 1e3 * reach, middle + 1e3 * reach, "stuck reading")
@@ -218,7 +208,7 @@ def _of_input(item: Variable) -> list[Effect]:
     name, unit = item.name, item.unit
     at: dict[str, Any] = {"input": name, "location": name}
     in_unit = "" if unit == "1" else f" {unit}"
-    times: dict[str, Any] = {**at, "upper": LONGEST_MIN, "start_values": TIMES_MIN}
+    times: dict[str, Any] = {**at, **TIMES}
     share = f"{{}} % more {name} than commanded", f"{{}} % less {name} than commanded"
     higher = f"{name} higher by {{}}{in_unit} than commanded", f"{name} lower by {{}}{in_unit} than commanded"
     follows = f"{name} follows its command with a time constant of {{}} min"
@@ -228,7 +218,8 @@ def _of_input(item: Variable) -> list[Effect]:
         "unit": unit,
         "upper": LARGEST_SCALES * item.scale,
         "typical": 0.2 * item.scale,
-        "start_values": tuple(scales * item.scale for scales in STICTION_SCALES),
+        # thresholds that are tried
+        "start_values": tuple(scales * item.scale for scales in (0.01, 0.03, 0.1, 0.3, 1.0, 3.0)),
     }
     offset = {**_deviation(unit, item.scale), **at}
     return [
@@ -260,7 +251,7 @@ def _of_parameter(model: ProcessModel, item: Parameter) -> Effect:
         parameter=item.name,
         unit=item.unit if in_unit else "1",
         lower=lower if in_unit else max(lower, -0.99),
-        upper=upper if in_unit else min(upper, LARGEST_SHARE),
+        upper=upper if in_unit else min(upper, 4.0),  # five times the value
         typical=min(usual, 0.5 * upper) or max(-usual, 0.5 * lower),
     )
 
@@ -337,7 +328,7 @@ class EffectChanges:
         )
 
     def _evaluate(self, function: ca.Function, number: int, size: float) -> Array:
-        rng = np.random.default_rng([SEED, number])
+        rng = np.random.default_rng([1, number])
         u = [rng.uniform(item.lower, item.upper) for item in self._own.inputs]
         x = [rng.uniform(item.lower, item.upper) for item in self._own.states]
         x += rng.uniform(0.0, max(u, default=1.0), self.n_states).tolist()  # states of the effect
@@ -402,4 +393,4 @@ def _agree(one: Array, other: Array) -> bool:
         return False
     one, other = one[finite], other[finite]
     size = np.max(np.abs(one), axis=0)
-    return bool(np.any(size)) and bool(np.all(np.abs(one - other) <= AGREEMENT * size + 1e-12))
+    return bool(np.any(size)) and bool(np.all(np.abs(one - other) <= 1e-6 * size + 1e-12))  # of the change

@@ -26,7 +26,7 @@ import numpy as np
 from reactorwatch.arrays import Array
 
 MODEL_CACHE_SIZE = 64
-"""Number of models whose functions are cached."""
+"""Number of models whose functions are cached: a diagnosis fits some sixty."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +102,7 @@ class Place:
     Attributes:
         name: name of the place, unique in its process.
         location: location in a diagnosis; several places may share one.
-        kind: kind of the correction, see `places`.
+        kind: kind of the correction, see `reactorwatch.process.law`.
         of: state, input, parameter or output that is corrected; empty for a factor.
         flows: for a factor, the name of the model's term in each balance, by state.
         variables: states, inputs and terms that the correction may depend on, the likeliest first.
@@ -174,7 +174,7 @@ class ProcessModel:
         resets: new value of a state when a row begins, from the states before and the new inputs, by name of the state.
         time_offset: minutes by which the clock is ahead of the states; while it grows, the states' time step is
             shorter.
-        places: where something unknown may act; empty: they follow from the equations (`process.places`).
+        places: where something unknown may act; empty: they follow from the equations (`process.law`).
         laws: laws of what was unknown, which are part of the equations already.
         effects: effects of its own; None: those of the catalogue under its name.
         uncertain: what a filter of this model estimates beside the states, see `kalman.filter_states`; no part of

@@ -21,8 +21,6 @@ from reactorwatch.process.model import ProcessModel, Variable
 SetPoint: TypeAlias = float | tuple[tuple[float, float], ...]
 """One value, or steps as pairs of plant time in min and value, the first at 0."""
 
-_EDGE_MIN = 1e-9  # rounding of a row's time relative to a step
-
 
 class Controller(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A proportional-integral controller of an output by an input.
@@ -62,7 +60,8 @@ class Controller(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     def set_point_at(self, time_min: float) -> float:
         """The set point at a plant time of at least 0."""
-        return [value for time, value in self.steps if time <= time_min + _EDGE_MIN][-1]
+        # Rounding of a row's time relative to a step.
+        return [value for time, value in self.steps if time <= time_min + 1e-9][-1]
 
     @property
     def is_integral(self) -> bool:

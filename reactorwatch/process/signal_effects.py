@@ -17,7 +17,7 @@ eqs. 1-4): over a window theta,
     theta dq_i/dt = (2i + 1) (sum_j a_ij q_j + (-1)^i y),    a_ij = -1 where i < j, else (-1)^(i-j+1),
     y(t - m) = sum_i P_i(2 m/theta - 1) q_i,
 
-less the sum's error at m = 0. Up to `WINDOW_MIN` the window does not depend on m, so the delay may set in, grow and
+less the sum's error at m = 0. Up to 1 min the window does not depend on m, so the delay may set in, grow and
 disappear, and the polynomials have a derivative with respect to m at zero.
 """
 
@@ -34,9 +34,6 @@ from reactorwatch.process.simulate import symbolic_step
 QUICK_MIN = 0.07
 """Half of this is 0.7 of the longest step of the integrator, so a lag is never stiff: a step's error is 0.001 of the
 followed value. With 0.1 min a lag of 0.03 min erred by a tenth of the sensors' noise, which 7,500 rows reveal."""
-
-WINDOW_MIN = 1.0
-"""Length of the past that the states of a delay represent; the delay if that is longer."""
 
 COEFFICIENTS = 10
 """Number of Legendre polynomials of a delay. With the reactor's coolant stepping every minute over its whole range, the
@@ -93,7 +90,7 @@ def add_delay(
     """
     q = [state.symbol for state in states]
     delay = nonnegative(delay_min)
-    window = ca.fmax(delay, WINDOW_MIN)
+    window = ca.fmax(delay, 1.0)  # the past that the states represent, at least
     # The sum over j of a_ij q_j: all after i, and the alternating sum up to i, each carried along.
     after, alternating = sum(q, ca.SX(0)), ca.SX(0)
     for i, state in enumerate(states):

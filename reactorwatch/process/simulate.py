@@ -22,21 +22,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reactorwatch.arrays import Array
-from reactorwatch.codegen.array_function import ArrayFunction
-from reactorwatch.codegen.compiled_function import CompiledFunction
+from reactorwatch.codegen.compiled_function import ArrayFunction, CompiledFunction
 from reactorwatch.process.model import MODEL_CACHE_SIZE, ProcessModel
 
-LONGEST_STEP_MIN = 0.05
-SHORTEST_STEP_MIN = 1e-9  # 60 ns: no plant is as fast
-MAX_STEPS = 100_000
-"""Largest number of steps between two samples: some half a second. Beyond it the equations count as too stiff."""
-
+LONGEST_STEP_MIN = 0.05  # inside the tolerance on the reactor's operating branch, see above
 TOLERANCE = 1e-6
 """Allowed local error of a step, relative to `Variable.scale` of each state."""
-
-MEMORY_SLACK = 100
-"""Tolerance of the states that effects add (`ProcessModel.at_rest`) over that of the process's own states. These are
-linear and stable, so errors do not grow, and after a jump of an input they respond as fast as a step is long."""
 
 _TIMES = (0.0, 1 / 5, 3 / 10, 3 / 5, 1.0, 7 / 8)
 _STAGES: tuple[tuple[float, ...], ...] = (
@@ -102,7 +93,9 @@ def symbolic_step(model: ProcessModel) -> ca.Function:
         slopes.append(rhs(x + passed * _weighted_sum(weights, slopes), u, p, t + time * h, middle)[0])
     after = x + passed * _weighted_sum(_FIFTH_ORDER, slopes)
     error = passed * _weighted_sum(_ERROR, slopes)
-    scales = ca.DM([state.scale * (MEMORY_SLACK if state.name in model.at_rest else 1) for state in model.states])
+    # States that effects add are linear and stable, so their errors do not grow; after a jump of an input they respond
+    # as fast as a step is long.
+    scales = ca.DM([state.scale * (100 if state.name in model.at_rest else 1) for state in model.states])
     return ca.Function(
         "step",
         [x, u, p, t, middle, h],
@@ -221,10 +214,10 @@ class Stepper:
                 count += 1
                 state[:] = after
                 step = min(LONGEST_STEP_MIN, step * min(5.0, 0.9 * max(error, 1e-10) ** -0.2))
-                stuck = count > MAX_STEPS
+                stuck = count > 100_000  # some half a second: the equations are too stiff
             else:
                 step *= max(0.1, 0.9 * error**-0.2) if good else 0.1
-                stuck = step < SHORTEST_STEP_MIN
+                stuck = step < 1e-9  # 60 ns: no plant is as fast
             if stuck:
                 where = zip(self._model.states, state.tolist(), strict=True)
                 values = ", ".join(f"{item.name} = {value:g} {item.unit}" for item, value in where)
@@ -284,17 +277,13 @@ class Simulator:
             SimulationError: the equations cannot be integrated further.
         """
         inputs, start, p = self._check(time_min, inputs, start, changes)
-        start = self._complete_start(start, inputs[0], p, float(time_min[0]))
+        if start.size < len(self.model.states):
+            start = np.array(self._complete(start, inputs[0], p, float(time_min[0]))).ravel()
+        start = self._stepper.start_row(start, inputs[0], p, float(time_min[0]))
         grid = step_grid(time_min, p[self._breakpoints])
         states = np.vstack([start, self._run_steps(grid, inputs, start, p)[grid.end_of_row]])
-        (y,) = _compiled_outputs(self.model).map(states, inputs, p, time_min)
+        (y,) = compiled_outputs(self.model).map(states, inputs, p, time_min)
         return Trajectory(time_min, states, y[:, :, 0])
-
-    def _complete_start(self, start: Array, u: Array, p: Array, start_min: float) -> Array:
-        """Full state after the jumps at the first row."""
-        if start.size < len(self.model.states):
-            start = np.array(self._complete(start, u, p, start_min)).ravel()
-        return self._stepper.start_row(start, u, p, start_min)
 
     def _run_steps(self, grid: StepGrid, inputs: Array, start: Array, p: Array) -> Array:
         """State after each step.
@@ -369,7 +358,7 @@ def _compiled_steps(model: ProcessModel) -> CompiledFunction:
 
 
 @lru_cache(maxsize=MODEL_CACHE_SIZE)
-def _compiled_outputs(model: ProcessModel) -> CompiledFunction:
+def compiled_outputs(model: ProcessModel) -> CompiledFunction:
     """(x, u, p, t) -> y."""
     x, u, p, t, y = model.output_expressions()
     return CompiledFunction(ca.Function("outputs", [x, u, p, t], [y]), shared=[2])

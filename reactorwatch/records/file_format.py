@@ -7,6 +7,10 @@ from dataclasses import dataclass, fields, replace
 from reactorwatch.errors import InputError, describe_unknown
 from reactorwatch.limits import limits
 
+TIME_COLUMN, RUN_COLUMN, CLOCK_COLUMN = "time_min", "run", "time"
+"""Columns that a written table has beside the signals: minutes, the run of each row if there are several, and clock
+time if it is asked for."""
+
 SECONDS = {"ns": 1e-9, "us": 1e-6, "ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
 """Seconds in each unit of time."""
 

@@ -45,8 +45,6 @@ _UA = 0x4000_0000
 """Lowest code of OPC UA that is not good (Part 4, 7.39: the two highest bits are the severity)."""
 _DA = 0xC0
 """Bits of a good value in OPC DA (Custom Interface 3.00, 6.8): 192 to 255."""
-_DA_BAD = frozenset((500, 504, 505))
-"""Codes with these bits that are not good: stale (Ignition), no number and no row (InSQL)."""
 _INSQL = {0: True, 1: False, 16: False, 133: True}
 """Codes of InSQL's column `Quality`."""
 
@@ -210,7 +208,8 @@ def _judge_codes(
         return {code: value < _UA for code, value in severe.items()} if is_whole else {}
     if any(_DA <= code <= 0xFF for code in codes) or has_word or "opcquality" in name or "detail" in name:
         is_whole = all(0 <= code < _UA for code in codes)
-        return {code: code & _DA == _DA and code not in _DA_BAD for code in codes} if is_whole else {}
+        # Stale (Ignition), no number and no row (InSQL) are not good.
+        return {code: code & _DA == _DA and code not in (500, 504, 505) for code in codes} if is_whole else {}
     if sign is not None and codes <= {0, 1}:
         return {code: bool(code) == sign for code in codes}
     is_insql = 133 in codes or any(_key(other) in ("opcquality", "qualitydetail") for other in beside)
@@ -249,17 +248,6 @@ _UNIT = re.compile(r"unit|uom|einheit", re.IGNORECASE)
 SHARED, SORTED, RESTARTING, ALTERNATING, REGULAR = "shared", "sorted", "restarting", "alternating", "regular"
 """Arrangements of rows: several have one time; they are sorted by tag, on a clock, or with minutes that start again as
 those of batches do; tags alternate, or so do the labels of rows at regular times."""
-
-MAX_TAGS = 0.5
-"""Largest share of different tags among the rows."""
-MIN_DISTINCT = 0.9
-"""Smallest share of steps from a value of a tag to its next at which the time goes on."""
-MIN_SHARED = 1 / 6
-"""Smallest share of rows with the time of the row before; it is 1/2 for two tags that are sampled together."""
-MIN_CHANGES = 0.1
-"""Smallest share of rows with another tag than the row before, if each tag has times of its own."""
-MIN_EXPLAINED = 0.9
-"""Smallest share of the variance that tags of different quantities explain."""
 
 
 class LongFormat(NamedTuple):
@@ -328,7 +316,7 @@ def find_long_format(layout: Layout, stated: FileFormat, names: Collection[str])
             continue
         signs = (
             value is not None and _VALUE.search(headers[value]) is not None,
-            value is not None and _variance_share(TextTable(layout, minutes, [value]), value, index) >= MIN_EXPLAINED,
+            value is not None and _variance_share(TextTable(layout, minutes, [value]), value, index) >= 0.9,
             all(re.search(r"\d", label) for label in known),
         )
         is_shown = shape in (SHARED, SORTED) or (shape == RESTARTING and any(signs[:2]))
@@ -397,21 +385,24 @@ def _variance_share(table: TextTable, column: int, tags: NDArray[np.intp]) -> fl
 
 def _arrange(times: NDArray[Any], tags: NDArray[np.intp]) -> str:
     """Arrangement of rows that may be of several tags; empty: they are rows of a wide table."""
+    rare = 0.1  # share of rows with another tag than the row before, below which each tag has times of its own
+    distinct = 0.9  # least share of the steps from a value of a tag to its next at which the time goes on
     changed, steps = np.diff(tags) != 0, np.diff(times)
     changes = float(np.mean(changed)) if changed.size else 0.0
-    if not 1 <= tags.max(initial=0) < MAX_TAGS * tags.size or (changes < MIN_CHANGES and (steps > 0).all()):
+    # Half of the rows at most have a tag of their own.
+    if not 1 <= tags.max(initial=0) < 0.5 * tags.size or (changes < rare and (steps > 0).all()):
         return ""  # most wide tables, without sorting
     order = np.argsort(tags, kind="stable")
     inner = np.diff(times[order])[np.diff(tags[order]) == 0]
-    if max(np.mean(inner > 0), np.mean(inner < 0)) < MIN_DISTINCT:
+    if max(np.mean(inner > 0), np.mean(inner < 0)) < distinct:
         return ""
     steps = steps if np.median(inner) > 0 else -steps  # the newest may be first
-    if np.mean(steps == 0) >= MIN_SHARED:
+    if np.mean(steps == 0) >= 1 / 6:  # it is 1/2 for two tags that are sampled together
         return SHARED
     if (steps < 0).any() and changed[steps < 0].all():
         return SORTED if times.dtype.kind == "i" else RESTARTING
-    is_regular = np.mean(np.isclose(steps, np.median(steps), rtol=0.1)) > MIN_DISTINCT and changes < MIN_DISTINCT
-    return "" if changes < MIN_CHANGES else REGULAR if is_regular else ALTERNATING
+    is_regular = np.mean(np.isclose(steps, np.median(steps), rtol=0.1)) > distinct and changes < distinct
+    return "" if changes < rare else REGULAR if is_regular else ALTERNATING
 
 
 class TagSeries(NamedTuple):

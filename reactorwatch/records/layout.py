@@ -24,7 +24,7 @@ from reactorwatch.records.table import (
     unit_of_name,
 )
 
-HEAD_BYTES = 65_536
+HEAD_BYTES = 65_536  # hundreds of lines of most files
 HEAD_LINES = 200
 """Lines from which the layout is guessed."""
 

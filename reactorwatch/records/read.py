@@ -13,7 +13,7 @@ from reactorwatch.arrays import Array
 from reactorwatch.errors import InputError, hint_at_closest
 from reactorwatch.records.cells import EMPTY, NUMBER, TEXT, describe_sentinels
 from reactorwatch.records.decode import read_text
-from reactorwatch.records.file_format import GUESS, FileFormat
+from reactorwatch.records.file_format import GUESS, RUN_COLUMN, FileFormat
 from reactorwatch.records.historian import (
     LongFormat,
     QualityFilter,
@@ -39,7 +39,6 @@ from reactorwatch.records.times import (
     numbered_runs,
     read_times,
 )
-from reactorwatch.records.write import RUN_COLUMN
 from reactorwatch.units import UnknownUnitError, conversion
 
 

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from reactorwatch.errors import InputError
 
 MINUTE_NS = 60_000_000_000
+"""Nanoseconds in a minute: times on the bus and in files are in nanoseconds, those of models in minutes."""
 
 NEVER_NS = 2**63 - 1
 """A time that does not come; the negative one is before all others."""
@@ -27,9 +28,6 @@ LARGEST_VALUE = 1e15
 
 LONGEST_MIN = 2.0**62 / MINUTE_NS
 """Largest time of a row, 146 years: sums of times must still fit 64 bits of nanoseconds."""
-
-SHIFT_NS = 1440 * MINUTE_NS
-"""A day: times before 1970 are shifted by whole days to be stored and published."""
 
 GAP_ROWS = 20
 """Gap between two runs in `Record.continuous_min`, in sampling periods: no row is predicted across it."""
@@ -130,7 +128,7 @@ class Record:
         earliest_min = float(self.time_min.min(initial=0.0))
         if self.zero_ns or not -LONGEST_MIN < earliest_min < 0:
             return self.zero_ns
-        return ceil(-earliest_min * MINUTE_NS / SHIFT_NS) * SHIFT_NS
+        return ceil(-earliest_min / 1440) * 1440 * MINUTE_NS
 
     @property
     def run_starts(self) -> tuple[int, ...]:

@@ -173,7 +173,7 @@ def split_line(line: str, separator: str) -> list[str]:
     return next(csv.reader(lines, delimiter=separator), [""])
 
 
-BLOCK_BYTES = 1 << 22
+BLOCK_BYTES = 1 << 22  # a smaller file is not worth a second thread
 _MISSING_CURE = "--missing {} reads it as not measured"
 
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from reactorwatch.errors import InputError
 from reactorwatch.records.cells import NUMBER, TIME
-from reactorwatch.records.file_format import SECONDS, FileFormat
+from reactorwatch.records.file_format import CLOCK_COLUMN, SECONDS, FileFormat
 from reactorwatch.records.record import LONGEST_MIN, MINUTE_NS, to_time_ns
 from reactorwatch.records.table import Layout, TextTable, bare_name
 from reactorwatch.records.timestamps import (
@@ -24,7 +24,6 @@ from reactorwatch.records.timestamps import (
     stated_pattern,
     to_utc,
 )
-from reactorwatch.records.write import CLOCK_COLUMN
 
 STANDARD = {"time_min": "min", "time_s": "s"}
 """Names of time columns that need no guess, and their units."""
@@ -48,10 +47,6 @@ _UNIT_WORDS = (
 )
 _UNIT_OF = {word: words.split()[0] for words in _UNIT_WORDS for word in words.split()}
 PLAIN = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?")
-_EPOCH_S, _EPOCH_UNITS_S = (6.3e8, 4.2e9), (1.0, 1e-3, 1e-6, 1e-9)
-"""Smallest and largest Unix times of 1990 to 2100, and their units in seconds."""
-_SERIAL_DAYS, _SERIAL_ZERO, _SERIAL_STEP = (32_874, 73_050), 25_569, 0.05
-"""Days of a spreadsheet from 1990 to 2100, that of 1970, and steps that are shorter than those of other numbers."""
 
 
 @dataclass(frozen=True)
@@ -188,17 +183,15 @@ def find_epoch(layout: Layout, item: TimeColumn, values: NDArray[np.float64]) ->
     if item.is_standard or not usable.size:
         return None
     low, high = float(usable.min()), float(usable.max())
-    for unit_s in _EPOCH_UNITS_S:
-        if (
-            _EPOCH_S[0] <= low * unit_s
-            and high * unit_s <= _EPOCH_S[1]
-            and (not item.unit or SECONDS[item.unit] == unit_s)
-        ):
+    for unit_s in (1.0, 1e-3, 1e-6, 1e-9):
+        is_in_range = low * unit_s >= 6.3e8 and high * unit_s <= 4.2e9  # 1990 to 2100
+        if is_in_range and (not item.unit or SECONDS[item.unit] == unit_s):
             return Epoch("seconds since 1970", unit_s)
     is_dated = "dat" in layout.names[item.columns[0]].lower()
-    is_dense = usable.size > 1 and float(np.abs(np.diff(usable)).max()) < _SERIAL_STEP
-    if _SERIAL_DAYS[0] <= low and high <= _SERIAL_DAYS[1] and item.unit in ("", "d") and (is_dated or is_dense):
-        return Epoch("days of a spreadsheet", SECONDS["d"], _SERIAL_ZERO)
+    is_dense = usable.size > 1 and float(np.abs(np.diff(usable)).max()) < 0.05  # other numbers have longer steps
+    is_in_range = low >= 32_874 and high <= 73_050  # 1990 to 2100
+    if is_in_range and item.unit in ("", "d") and (is_dated or is_dense):
+        return Epoch("days of a spreadsheet", SECONDS["d"], 25_569)
     return None
 
 
@@ -216,10 +209,6 @@ def _refuse_without_time(layout: Layout, taken: Collection[int]) -> None:
         f"{layout.path}, row {layout.header_row or layout.first_row}: expected a column {expected} in the header, "
         f"or another that looks like a time, got {found}; state --time NAME, or --period"
     )
-
-
-MIN_REVERSED = 3
-"""Fewest rows of a file that may have its newest row first."""
 
 
 @dataclass(frozen=True)
@@ -278,7 +267,7 @@ def read_times(table: TextTable, column: TimeColumn, stated: FileFormat) -> Time
 
 def is_newest_first(layout: Layout, column: TimeColumn, dates: str | None) -> bool:
     """True if the first rows are before the rows above them, but for blocks that were written again."""
-    if not column.columns or len(layout.sample) < MIN_REVERSED:
+    if not column.columns or len(layout.sample) < 3:  # fewer rows have no order
         return False
     if column.pattern is None:
         steps = np.diff(sample_values(layout, column.columns[0]))
@@ -384,7 +373,7 @@ def numbered_runs(table: TextTable, column: int | None) -> NDArray[np.intp] | No
     if column is None:
         return None
     cells = [cell.strip() for cell in table.texts(column).to_pylist()]
-    if not all(cell.isdecimal() and len(cell) < LONGEST_NUMBER for cell in cells):
+    if not all(cell.isdecimal() and len(cell) < 18 for cell in cells):  # 64 bits hold them
         return None
     runs = np.array([int(cell) for cell in cells], dtype=np.intp)
     steps = np.diff(runs, prepend=0)
@@ -457,7 +446,3 @@ def find_runs(
             f"{np.count_nonzero(back)} of {minutes.size} rows; sort the rows by time"
         )
     return 1 + np.cumsum(starts) if starts.any() else None
-
-
-LONGEST_NUMBER = 18
-"""Most digits of a run's number."""

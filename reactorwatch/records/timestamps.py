@@ -49,7 +49,8 @@ _OFFSETS_H = {"WET": 0, "BST": 1, "WEST": 1, "CET": 1, "MEZ": 1, "CEST": 2, "MES
 _OFFSETS_H |= {"EET": 2, "EEST": 3, "EST": -5, "EDT": -4, "CST": -6, "CDT": -5, "MST": -7, "MDT": -6, "PST": -8}
 _OFFSETS_H |= {"PDT": -7, "JST": 9}
 
-DAY_NS = 86_400_000_000_000
+HOUR_NS = 3_600_000_000_000
+DAY_NS = 24 * HOUR_NS
 
 ORDERS = DAY_FIRST, MONTH_FIRST = "day-first", "month-first"
 _FIXED_ZONE = re.compile(r"(?:UTC|GMT)?([+-])(\d{1,2})(?::?(\d{2}))?")
@@ -243,9 +244,6 @@ def fixed_offset_s(zone: str) -> int | None:
     if match is None:
         return None
     return (1 if match[1] == "+" else -1) * (int(match[2]) * 3600 + int(match[3] or 0) * 60)
-
-
-HOUR_NS = 3_600_000_000_000
 
 
 def to_utc(local_ns: NDArray[np.int64], zone: str, refuse: Callable[[int, str], NoReturn]) -> NDArray[np.int64]:

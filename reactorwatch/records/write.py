@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 from reactorwatch.errors import InputError
 from reactorwatch.records.decode import PARQUET_SUFFIXES, list_files, quote_formula
+from reactorwatch.records.file_format import CLOCK_COLUMN, RUN_COLUMN, TIME_COLUMN
 
 if TYPE_CHECKING:
     from reactorwatch.records.record import Record  # it imports NumPy, and help is to be fast
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
 _FILE_SUFFIX = re.compile(r"\.[A-Za-z][A-Za-z0-9]{1,6}")
 """A new folder has no such suffix, which looks like that of a file."""
 
-_HEAD_BYTES = 65_536
+_HEAD_BYTES = 65_536  # more than any header has
 
 
 def check_output_file(path: Path, sources: Iterable[Path | None] = (), *, force: bool = False) -> Path:
@@ -313,11 +314,7 @@ def fill_folder(folder: Path) -> Iterator[Path]:
         shutil.rmtree(temporary)
 
 
-TIME_COLUMN, RUN_COLUMN, CLOCK_COLUMN = "time_min", "run", "time"
-"""Columns beside the signals: minutes, the run of each row if there are several, and clock time if it is asked for."""
-
 WRITTEN_SUFFIXES = (".csv", ".gz", ".xlsx", ".parquet")
-MAX_SHEET_ROWS = 1_048_576
 
 
 def write_table(path: Path, record: "Record", *, clock: bool = False) -> None:
@@ -388,10 +385,8 @@ def _write_text(path: Path, record: "Record", clock: bool, *, compress: bool = F
 
 
 def _write_workbook(path: Path, record: "Record", clock: bool) -> None:
-    if record.rows >= MAX_SHEET_ROWS:
-        raise InputError(
-            f"{path}: a sheet has at most {MAX_SHEET_ROWS} rows, got {record.rows}; write .parquet or .csv"
-        )
+    if record.rows >= 1_048_576:  # of Excel since 2007
+        raise InputError(f"{path}: a sheet has at most 1048576 rows, got {record.rows}; write .parquet or .csv")
     try:
         import openpyxl
     except ImportError as error:

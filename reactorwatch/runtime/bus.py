@@ -1,11 +1,12 @@
-"""The bus protocol. The nodes know only this; `bus_zenoh` implements it."""
+"""Protocols of the bus, which `bus_zenoh` implements, and of a node as the event loop drives it."""
 
 from collections.abc import Callable
 from typing import Protocol, TypedDict, Unpack
 
 from google.protobuf.message import Message
 
-from reactorwatch.contract.codec import Encoded
+from reactorwatch.contract.codec import Encoded, Publication
+from reactorwatch.contract.messages_pb2 import CommandReply
 from reactorwatch.runtime.reorder_buffer import Gap
 
 MAX_BATCH = 2000
@@ -92,3 +93,30 @@ class Bus(Protocol):
 
     def close(self) -> None:
         """Send all queued messages and disconnect."""
+
+
+class Node(Protocol):
+    """A core, or a core with its files; the default answers are those of a node without subscriptions and commands."""
+
+    def on_message(self, message: Encoded, now_ns: int) -> list[Publication]:
+        """Handle a message on a subscribed key."""
+        return []
+
+    def on_command(self, question: Encoded, now_ns: int) -> tuple[CommandReply | None, list[Publication]]:
+        """Handle a command; the reply is None if another node answers it."""
+        return CommandReply(accepted=False, text="this node has no commands"), []
+
+    def on_tick(self, now_ns: int) -> list[Publication]:
+        """Handle the deadline that `next_tick_ns` named."""
+
+    def next_tick_ns(self) -> int:
+        """Time of the next tick, by the clock that `now_ns` is read from."""
+
+    @property
+    def finished(self) -> bool:
+        """True if the node has nothing left to do and the loop ends."""
+        return False
+
+    def on_stop(self, now_ns: int) -> list[Publication]:
+        """Return the node's last publications; the loop ends."""
+        return []

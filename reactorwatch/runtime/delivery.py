@@ -17,12 +17,9 @@ from typing import NamedTuple
 
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded
+from reactorwatch.runtime.acl import ROLES, Role
 from reactorwatch.runtime.reorder_buffer import Gap, ReorderBuffer
-from reactorwatch.runtime.security.acl import ROLES, Role
 
-MAX_STREAMS_QUERIED = 100
-"""Streams whose publishers are queried again at once: with more than that the network broke down, and the queries would
-never end."""
 QUERY_ALL_INTERVAL_NS = 60_000_000_000
 """Shortest time between two queries for all that is cached of a stream: thousands of messages a key."""
 
@@ -163,7 +160,8 @@ class Delivery:
                     return
                 self._deliver(self._buffer.release_overdue(now_ns, only_queried=True))
                 overdue = self._buffer.take_overdue(now_ns)
-            for stream, after_ns in islice(overdue.items(), MAX_STREAMS_QUERIED):
+            # with more, the network broke down, and the queries would never end
+            for stream, after_ns in islice(overdue.items(), 100):
                 if self._closed.is_set():
                     return
                 self._recover(stream, (now_ns - after_ns) / 1e9)

@@ -14,27 +14,26 @@ from collections.abc import Callable, Iterator
 from functools import partial
 from queue import Empty, SimpleQueue
 from types import FrameType
-from typing import TypeAlias
+from typing import TypeAlias, TypeVar
 
 from reactorwatch.contract.codec import Encoded, Publication, encode
-from reactorwatch.runtime.bus import MAX_BATCH, Bus, Request
-from reactorwatch.runtime.clock import SteadyClock
-from reactorwatch.runtime.node import Node
+from reactorwatch.errors import is_passing
+from reactorwatch.runtime.acl import audit
+from reactorwatch.runtime.bus import MAX_BATCH, Bus, Node, Request
 from reactorwatch.runtime.reorder_buffer import Gap
-from reactorwatch.runtime.security.acl import audit
 
-MAX_WAIT_S = 3600.0
 MAX_DRAIN_FACTOR = 10
 """Multiple of `drain_timeout_s` after which a node ends although messages still arrive."""
 MAX_INBOX_MESSAGES = 100_000
 MAX_INBOX_BYTES = 64 << 20  # of payload
 """Beyond either the bus's thread is blocked, and with it the publishers that are too fast for the node."""
-POLL_S = 0.1
+POLL_S = 0.1  # a person does not notice it
 _END = b"\0"  # no signal has this number
 BATCH = 256  # messages after which no further item is handled before the loop reads the clock again
 
 
-_Item: TypeAlias = tuple[Callable[..., list[Publication]], tuple[object, ...], int, int]
+_Handler: TypeAlias = Callable[..., list[Publication]]
+_Item: TypeAlias = tuple[_Handler, tuple[object, ...], int, int]
 """A function whose result is published, its arguments before the time, and the messages and payload bytes in these.
 
 A plain tuple is made in an eighth of the time of a named one, and the loop takes one a message."""
@@ -63,13 +62,7 @@ class _Inbox:
         stop.call_on_set(lambda: self.put(_no_publications))
         stop.call_on_set(self._room.set)
 
-    def put(
-        self,
-        function: Callable[..., list[Publication]],
-        arguments: tuple[object, ...] = (),
-        messages: int = 0,
-        payload: int = 0,
-    ) -> None:
+    def put(self, function: _Handler, arguments: tuple[object, ...] = (), messages: int = 0, payload: int = 0) -> None:
         """Append a function to call; from threads of the bus. One with messages blocks until there is room."""
         if messages:
             while self._is_full and not (self._stop.is_set or self._closed or self._is_blocked):
@@ -244,10 +237,8 @@ class EventLoop:
         on_publish: Callable[[Publication], None] | None = None,
         on_backlog: Callable[[bool], None] = lambda _has_backlog: None,
     ) -> None:
-        self._on_backlog = on_backlog
         self._node, self._bus, self._stop = node, bus, stop
-        self._drain_timeout_s = drain_timeout_s
-        self._on_publish = on_publish
+        self._drain_timeout_s, self._on_publish, self._on_backlog = drain_timeout_s, on_publish, on_backlog
         self._clock = SteadyClock()
         self._inbox = _Inbox(stop)
         self._published = 0
@@ -276,12 +267,12 @@ class EventLoop:
         def put_message(message: Encoded) -> None:
             self._inbox.put(self._node.on_message, (message,), 1, len(message.payload))
 
-        def put_batch(handle: Callable[[list[Encoded], int], list[Publication]], messages: list[Encoded]) -> None:
+        def put_batch(handle: _Handler, messages: list[Encoded]) -> None:
             for start in range(0, len(messages), MAX_BATCH):  # a history comes at once: many thousands
                 part = messages[start : start + MAX_BATCH]
                 self._inbox.put(handle, (part,), len(part), sum([len(message.payload) for message in part]))
 
-        def put_gap(handle: Callable[[Gap, int], list[Publication]], gap: Gap) -> None:
+        def put_gap(handle: _Handler, gap: Gap) -> None:
             self._inbox.put(handle, (gap,), 1)
 
         def end_history(on_end: Callable[[], None], _now_ns: int) -> list[Publication]:
@@ -294,11 +285,9 @@ class EventLoop:
         for expression in key_expressions:
             subscribe(
                 expression,
-                on_gap=None if on_gap is None else partial(put_gap, on_gap),
+                on_gap=on_gap and partial(put_gap, on_gap),
                 history_s=history_s,
-                on_history_end=None
-                if on_history_end is None
-                else partial(self._inbox.put, end_history, (on_history_end,)),
+                on_history_end=on_history_end and partial(self._inbox.put, end_history, (on_history_end,)),
             )
 
     def call(self, function: Callable[[int], list[Publication]]) -> None:
@@ -342,14 +331,14 @@ class EventLoop:
             self._on_backlog(self._inbox.has_backlog)
             self._publish(self._node.on_tick(self._clock.now_ns()))
         handled = 0
-        while handled < BATCH and (messages := self._handle_next(min(wait_s, MAX_WAIT_S))):
+        while handled < BATCH and (messages := self._handle_next(min(wait_s, 3600.0))):
             handled += messages
             wait_s = 0.0
 
     def _drain(self) -> None:
         """Handle messages that were on their way when the stop was requested."""
-        deadline = time.monotonic() + MAX_DRAIN_FACTOR * self._drain_timeout_s
         left_s = MAX_DRAIN_FACTOR * self._drain_timeout_s
+        deadline = time.monotonic() + left_s
         while left_s > 0 and self._handle_next(min(self._drain_timeout_s, left_s)):
             left_s = deadline - time.monotonic()
         self._handle_rest()
@@ -361,8 +350,7 @@ class EventLoop:
 
     def _handle_next(self, timeout_s: float) -> int:
         """Handle the next item; returns the number of its messages, at least 1, or 0 if none arrived in time."""
-        item = self._inbox.get(timeout_s)
-        if item is None:
+        if (item := self._inbox.get(timeout_s)) is None:
             return 0
         function, arguments, messages, _ = item
         self._publish(function(*arguments, self._clock.now_ns()))
@@ -385,3 +373,76 @@ class EventLoop:
             self._inbox.publication = self._published
             self._bus.publish(encode(publication))
             self._inbox.publication = 0
+
+
+class SteadyClock:
+    """Clock of a loop, from any thread: the machine's clock, but it never runs backwards and never stops.
+
+    If the machine's clock is set forward, this one follows at once. If it is set back, this one slews: it runs at 0.9
+    times its speed until the machine's clock has caught up; a node that followed would be idle for as long as the clock
+    was set back.
+
+    Args:
+        wall_ns: reads the machine's clock.
+        monotonic_ns: reads a clock that cannot be set.
+    """
+
+    def __init__(
+        self, wall_ns: Callable[[], int] = time.time_ns, monotonic_ns: Callable[[], int] = time.monotonic_ns
+    ) -> None:
+        self._wall_ns, self._monotonic_ns = wall_ns, monotonic_ns
+        self._lock = threading.Lock()
+        self._monotonic, self._now_ns = monotonic_ns(), wall_ns()
+
+    def now_ns(self) -> int:
+        """Nanoseconds since 1970-01-01 UTC."""
+        with self._lock:
+            monotonic = self._monotonic_ns()
+            slewed_ns = self._now_ns + int(0.9 * (monotonic - self._monotonic))
+            self._monotonic, self._now_ns = monotonic, max(self._wall_ns(), slewed_ns)
+            return self._now_ns
+
+
+Result = TypeVar("Result")
+
+
+def retry(
+    attempt: Callable[[], Result],
+    wait: Callable[[float], bool],
+    on_failure: Callable[[str, bool], object],
+    passes: Callable[[BaseException], bool] = is_passing,
+) -> Result | None:
+    """Call a function until it raises no error that can pass: a full disk, a folder without rights, a taken address.
+
+    Other errors are raised at once. The waits double from 0.1 s to 2 s.
+
+    Args:
+        attempt: the function.
+        wait: waits for so many seconds; returns True, early, once a stop is requested.
+        on_failure: called after each failure with its reason, and True if the failure before had another reason.
+        passes: True for an error that can pass.
+
+    Returns:
+        The result of the function; None if a stop was requested first.
+    """
+    retry_s, before = 0.1, ""
+    while not wait(0.0):
+        try:
+            return attempt()
+        except Exception as error:
+            if not passes(error):
+                raise
+            reason = describe(error)
+        on_failure(reason, reason != before)
+        before = reason
+        if wait(retry_s):
+            break
+        retry_s = min(2 * retry_s, 2.0)
+    return None
+
+
+def describe(error: BaseException) -> str:
+    """Reason of a failure in one line; an error of the system names its file."""
+    if isinstance(error, OSError) and error.strerror is not None:
+        return f"{error.filename}: {error.strerror}" if error.filename is not None else error.strerror
+    return next(iter(str(error).splitlines()), type(error).__name__)

@@ -32,10 +32,10 @@ from reactorwatch.runtime.gap_tracker import GapTracker
 
 Item = TypeVar("Item")
 
-TIMEOUT_NS = 5_000_000_000
+TIMEOUT_NS = 5_000_000_000  # of a stream whose keys have all gone on: what they passed is lost
 RECOVERY_TIMEOUT_NS = 15_000_000_000
 """Zenoh gives a query up after 10 s; then it releases what it has."""
-POLL_NS = 250_000_000
+POLL_NS = 250_000_000  # within the timeout it makes no difference
 START_WINDOW_NS = 500_000_000
 MAX_STREAMS = 100_000
 """Largest number of stored streams. A restarted publisher is another stream, and so is each plant of a fleet."""
@@ -45,8 +45,6 @@ a second message: garbage makes one stream a message."""
 MAX_HELD = 1_000_000
 MAX_HELD_BYTES = 256 << 20
 """Messages of a stream that may be held, and their payload; beyond either, missing messages are given up."""
-MAX_LOST_RANGES = 100_000
-"""Ranges of lost numbers of a stream that are remembered, so that a message in one can still be released."""
 MAX_KEYS = 1000
 """Keys of a stream that are tracked."""
 
@@ -100,7 +98,7 @@ class HoldState(Generic[Item]):
 class StreamState(GapTracker, Generic[Item]):
     """Position in a stream; its gaps are given up, and a message in one is released at once."""
 
-    max_gaps = MAX_LOST_RANGES
+    max_gaps = 100_000
 
     publisher: int
     stream: str

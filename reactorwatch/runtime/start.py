@@ -25,15 +25,12 @@ from reactorwatch.runtime import bus_zenoh
 from reactorwatch.runtime.bus import Bus
 from reactorwatch.runtime.bus_zenoh import LEASE_S, ZenohBus
 from reactorwatch.runtime.config import BusConfig
-from reactorwatch.runtime.event_loop import StopSignal
-from reactorwatch.runtime.retry import Result, describe, retry
+from reactorwatch.runtime.event_loop import Result, StopSignal, describe, retry
 
 log = structlog.get_logger()
 
 GONE_WITHIN_S = LEASE_S + 2.0
 """Time after which the token of an instance that died without closing its connection has disappeared."""
-LOG_INTERVAL_S = 30.0
-"""Time between two lines in the log about what is waited for."""
 LOOK_AGAIN_S = (0.1, 0.5)
 """Bounds of the random time between two looks: of two instances that start at once, one looks first."""
 
@@ -163,4 +160,4 @@ def wait_alive(bus: Bus, plant: str, nodes: Collection[str], stop: StopSignal, w
         if stop.is_set or not missing:
             return not stop.is_set
         log.info("waiting", node=waiting, for_=", ".join(missing))
-        changed.wait(LOG_INTERVAL_S)
+        changed.wait(30.0)

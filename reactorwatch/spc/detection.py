@@ -26,9 +26,6 @@ from reactorwatch.spc.run_length import false_alarm_rates
 POWER = 0.9
 """Share of the cases in which a deviation is seen in time."""
 
-LATE_NODES = 8
-"""Nodes that stand for all rows beyond a path."""
-
 LOWEST = -4.0
 """Lowest distance from the limit, in standard deviations: a point there is out almost surely."""
 
@@ -99,6 +96,7 @@ def smallest_sizes(paths: Array, detectors: Sequence[Detector], horizons: Sequen
 
 def _chart_path(paths: Array, chart: Detector, horizons: Sequence[float], ramp_rows: float) -> _Path:
     """Path of a chart's average: in its rows, and beyond them by those of their later half."""
+    late_nodes = 8  # that stand for all rows beyond the path
     signals = paths[..., list(chart.signals)] @ chart.matrix.T
     rows = signals.shape[2]
     later = signals[:, :, rows // 2 :]
@@ -112,19 +110,19 @@ def _chart_path(paths: Array, chart: Detector, horizons: Sequence[float], ramp_r
     counts = [np.clip(np.minimum(ends, horizon + 1.0) - starts, 0.0, None) for horizon in horizons]
     beyond = np.array([max(horizon - rows, 0.0) for horizon in horizons])
     if ramp_rows:
-        times = rows + np.outer(beyond, (np.arange(LATE_NODES) + 0.5) / LATE_NODES)
+        times = rows + np.outer(beyond, (np.arange(late_nodes) + 0.5) / late_nodes)
         slope = later.mean(axis=2) / (ramp_rows * unit)
         end = signals[:, :, -1] / unit
         late = end[:, :, None] + slope[:, :, None] * (times.ravel()[None, None, :, None] - rows)
         late_size = np.linalg.norm(late, axis=3)
         late_rows = np.zeros((len(horizons), times.size))
         for index, count in enumerate(beyond):
-            late_rows[index, index * LATE_NODES : (index + 1) * LATE_NODES] = count / LATE_NODES
+            late_rows[index, index * late_nodes : (index + 1) * late_nodes] = count / late_nodes
     else:
-        shares = (np.arange(LATE_NODES) + 0.5) / LATE_NODES
+        shares = (np.arange(late_nodes) + 0.5) / late_nodes
         sizes = np.linalg.norm(smoothed[:, :, rows // 2 :], axis=3)
         late_size = np.moveaxis(np.quantile(sizes, shares, axis=2), 0, 2)
-        late_rows = np.repeat(beyond[:, None] / LATE_NODES, LATE_NODES, axis=1)
+        late_rows = np.repeat(beyond[:, None] / late_nodes, late_nodes, axis=1)
     mean = np.concatenate([np.linalg.norm(smoothed[:, :, nodes - 1], axis=3), late_size], axis=2)
     return _Path(mean, np.hstack([np.array(counts), late_rows]))
 

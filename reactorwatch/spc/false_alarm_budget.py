@@ -52,6 +52,7 @@ DAYS = 30
 """Days for which false alarms are promised."""
 
 DAYS_MIN = DAYS * 24 * 60.0
+"""The same in minutes."""
 
 USUAL_PER_30_DAYS = 1.0
 """False alarms of a plant that are promised where the settings ask for no number."""
@@ -79,7 +80,7 @@ def promise_per_30_days(asked: float | None, alarms: int, period_min: float) -> 
         InputError: charts cannot keep what is asked for.
     """
     rows = DAYS_MIN / period_min * alarms
-    fewest, most = rows / LONGEST_DESIGN, rows / (SHORTEST_ARL0)
+    fewest, most = rows / LONGEST_DESIGN, rows / SHORTEST_ARL0
     if asked is None:
         return min(max(USUAL_PER_30_DAYS, fewest), most)
     if not fewest <= asked <= most:

@@ -29,15 +29,6 @@ from reactorwatch.codegen.numba_kernel import Entry, jit
 LARGEST_ORDER = 6
 """Largest number of coefficients: a filter has room for so many past values."""
 
-BATCHES = 10
-"""Number of batches over which the squares of a training are averaged: longer than their correlation."""
-
-BLOCK = 50
-"""Rows of a block whose variance is compared with that of others."""
-
-LARGEST_SUM = 0.98
-"""Largest sum of the coefficients. Nearer to 1 the residual is a random walk, and no shift would be detected."""
-
 
 class Prewhitening(msgspec.Struct, frozen=True):
     """An autoregression of a residual, learned from its training.
@@ -102,8 +93,8 @@ def _fit(rows: Array, order: int, smallest_sd: float) -> Prewhitening:
     # Regularisation makes the coefficients of a constant residual 0.
     gram[np.diag_indices(order)] += 1e-9 * np.trace(gram) / order + max(smallest_sd**2, 1e-30)
     a = np.linalg.solve(gram, centred.T @ (target - target.mean()))
-    if a.sum() > LARGEST_SUM:
-        a *= LARGEST_SUM / a.sum()
+    if a.sum() > 0.98:  # nearer to 1 the residual is a random walk, and no shift would be detected
+        a *= 0.98 / a.sum()
     error = target - target.mean() - centred @ a
     freedom = len(rows) - order - 1
     variance = float(error @ error) / freedom
@@ -126,13 +117,14 @@ def _worst_block(error: Array) -> float:
     The fit of a linear model of a nonlinear plant varies with the operating point, and the worst fit makes the false
     alarms. So where blocks of rows differ significantly, sigma is that of the worst of them (the largest of twenty).
     """
-    blocks = error[: error.size // BLOCK * BLOCK].reshape(-1, BLOCK)
+    rows = 50  # of a block: its standard deviation is known to a tenth
+    blocks = error[: error.size // rows * rows].reshape(-1, rows)
     size = np.sqrt(np.mean(error**2)) if error.size else 0.0
     if len(blocks) < 8 or size <= 0.0:
         return 1.0
     sizes = np.sqrt(np.mean(blocks**2, axis=1)) / size
     fourth = float(np.mean(error**4)) / size**4
-    expected_variance = max(fourth - 1.0, 1.0) / (4.0 * BLOCK)
+    expected_variance = max(fourth - 1.0, 1.0) / (4.0 * rows)
     if float(np.var(sizes, ddof=1)) <= 2.0 * expected_variance:
         return 1.0
     return max(float(np.quantile(sizes, 0.95)), 1.0)
@@ -150,11 +142,11 @@ def _sd_variance(error: Array, freedom: int) -> float:
     if mean <= 0.0:
         return 1.0 / (2.0 * freedom)
     independent = (max(float((squares**2).mean()) / mean**2, 1.5) - 1.0) / (4.0 * freedom)
-    size = squares.size // BATCHES
+    size = squares.size // 10  # ten batches are longer than the correlation of the squares
     if size < 2:
         return independent
-    batches = squares[: size * BATCHES].reshape(BATCHES, size).mean(axis=1)
-    return max(independent, float(batches.var(ddof=1)) / (4.0 * mean**2 * BATCHES))
+    batches = squares[: size * 10].reshape(10, size).mean(axis=1)
+    return max(independent, float(batches.var(ddof=1)) / (4.0 * mean**2 * 10))
 
 
 def memory_sds(e: Array, weight: float) -> tuple[float, ...]:

@@ -11,7 +11,7 @@ time: `limit` times the usual spacing, which is the mean spacing plus twice its 
 over 32 samples, as in the retransmission timer of Jacobson (1988), Congestion avoidance and control, SIGCOMM. Evenly
 spaced samples are allowed `limit` periods, irregular ones and bursts accordingly more. A timeout enters the mean as no
 more than the allowed time, so that one does not spoil it; a plant that continues more slowly is learned after two or
-three. In receive time at least `least_s` is allowed, for delays of networks and computers. Before `LEARN_FROM` spacings
+three. In receive time at least `least_s` is allowed, for delays of networks and computers. Before MEMORY spacings
 are known there is no timeout.
 
 If the transport delayed samples and the plant never stopped, the next row clears the live alarm at the time at which it
@@ -21,8 +21,8 @@ The timeout of the plant is restarted by every row and every received sample. Th
 rows, which continue with NaN after a sensor has failed. A gap in all rows is no fault of a single sensor; the signals'
 timeouts are suppressed then, and only one alarm is raised.
 
-A signal with fewer than `LEARN_FROM` known spacings, or without any value, is measured by the plant's rows: its timeout
-is `UNKNOWN_ROWS` of their usual spacings.
+A signal with fewer than MEMORY known spacings, or without any value, is measured by the plant's rows: its timeout
+is 100 of their usual spacings.
 
 >>> from math import nan
 >>> timeout = DataTimeout(signals=1)
@@ -46,18 +46,8 @@ from reactorwatch.codegen.numba_kernel import Entry, jit, python_function
 from reactorwatch.errors import InputError, positive
 from reactorwatch.stored_state import Memory, Records
 
-LEARN_FROM = 32
-"""Spacings that must be known before a timeout."""
-
 MEMORY = 32
-"""Spacings in the exponential means."""
-
-UNKNOWN_ROWS = 100.0
-"""Usual spacings of the plant's rows within which every signal must have a value. An analyser may give one value in
-fifty rows; a signal without a value in these is not published, or its sensor has failed."""
-
-LATE_NS = 1_000_000_000
-"""If the check itself runs this late, the monitor was stalled; restart the timer instead of raising the alarm."""
+"""Spacings in the exponential means, all of which must be known before a timeout."""
 
 
 class Change(NamedTuple):
@@ -122,7 +112,7 @@ TIMEOUT = np.dtype([("spacing", SPACING), ("last_ns", "i8"), ("is_active", "i8")
 @jit
 def allowed_ns(s: Any, limit: float) -> int:
     """`limit` times the usual spacing; -1 before it is known."""
-    if s.count < LEARN_FROM:
+    if s.count < MEMORY:
         return -1
     return int(min(limit * (s.mean_ns + 2.0 * s.deviation_ns), float(LONGEST_NS)))
 
@@ -180,7 +170,7 @@ def _update(numbers: Any, time_ns: int, values: Array, limit: float, changes: ND
     changes[0, 0], changes[0, 1], changes[0, 2] = update_timeout(plant, time_ns, True, limit, -1)
     found = bool(changes[0, 0])
     if not np.isfinite(values).all():
-        fallback_ns = allowed_ns(plant.spacing, max(UNKNOWN_ROWS, limit))
+        fallback_ns = allowed_ns(plant.spacing, max(100.0, limit))  # an analyser may give one value in fifty rows
     for i in range(values.size):
         p = numbers[i + 1]
         if changes[0, 0] and not p.is_active:  # until now all signals had no data, not only this one
@@ -311,7 +301,7 @@ class DataTimeout:
         due_ns = self.due_ns()
         if due_ns is None or now_ns < due_ns:
             return NO_CHANGE
-        if now_ns - due_ns > LATE_NS:
+        if now_ns - due_ns > 1_000_000_000:  # the monitor was stalled for a second
             self.arm(now_ns)
             return NO_CHANGE
         return self.declare_timeout()

@@ -16,7 +16,7 @@ falls below it.
 
 While an alarm without a known cause is active, a fault may have moved the residual permanently, and values about its
 new level are no spikes. So a value is then compared with the median of recent ones, in units of their median deviation
-with a margin of three standard errors (but no less than before), and nothing is a spike before there are `LEAST_RECENT`
+with a margin of three standard errors (but no less than before), and nothing is a spike before there are 10
 of them.
 
 Every spike has its own value beyond the limit, so the rate of false spikes is never more than P(|z| > limit); that
@@ -54,14 +54,8 @@ from reactorwatch.errors import InputError, positive
 from reactorwatch.spc.charts.base import LARGEST_VALUE, finite
 from reactorwatch.stored_state import Memory
 
-RECENT, LEAST_RECENT = 100, 10
-"""Recent values with which a value is compared while an alarm is active, at most and at least."""
-
-LEAST_TAIL = 10
-"""Least number of the training's largest values, a twentieth, from which its tail is estimated."""
-
-FEWEST_ROWS = 5 * LEAST_TAIL
-"""Fewest residuals of a training: a fifth of them is then its tail."""
+FEWEST_ROWS = 50
+"""Fewest residuals of a training: a fifth of them is then its tail, ten values."""
 
 RATE_SHARE = 0.5
 """Length of the window in which spikes are counted, in lengths of the training."""
@@ -191,7 +185,7 @@ class Spike(Memory):
                 recent.clear()
             return self._decide(z)
         level, spread, is_decided = 0.0, 1.0, recent or self.phase in ("ordinary", "changed")
-        if len(recent) >= LEAST_RECENT:
+        if len(recent) >= 10:  # their median is then known
             level = median(recent)
             deviation = median(abs(value - level) for value in recent)
             # 1.4826: from the median absolute deviation to the standard one; its error is about 1 / sqrt(n).
@@ -207,7 +201,7 @@ class Spike(Memory):
 
     def _remember(self, z: float) -> None:
         self.recent.append(z)
-        del self.recent[:-RECENT]
+        del self.recent[:-100]
 
     def _decide(self, z: float) -> Verdict:
         """Decide on a residual about 0."""
@@ -296,7 +290,7 @@ def spike_limit(z: ArrayLike, arl0: float) -> float:
     sizes = np.sort(np.abs(np.asarray(z, dtype=np.float64)))
     if sizes.ndim != 1 or sizes.size < FEWEST_ROWS or not np.isfinite(sizes).all():
         raise InputError(f"z must be at least {FEWEST_ROWS} finite values in a row, got {sizes.size}")
-    tail = max(ceil(0.05 * sizes.size), LEAST_TAIL)
+    tail = max(ceil(0.05 * sizes.size), FEWEST_ROWS // 5)
     threshold = float(sizes[-tail - 1])
     seen = int(0.75 * tail)
     excess = sizes[-tail:][:seen] - threshold

@@ -12,7 +12,7 @@ outlier. With J and P the parts of the sum of squares that each explains, the st
 likelihood ratio approach to the detection and estimation of jumps in linear systems, IEEE Trans. Automatic Control 21;
 level shifts against outliers: Tsay 1988, Outliers, level shifts, and variance changes in time series, Journal of
 Forecasting 7.) Each J has one degree of freedom, so by chance one of them is beyond a limit L at most at the rate of
-`HYPOTHESES` times 2 Phi(-L) a row.
+the number of onsets times 2 Phi(-L) a row.
 
 An onset has to be at least `FEWEST_LATER` rows ago, since a step is one that lasts.
 
@@ -44,9 +44,6 @@ ONSETS = 20
 
 FEWEST_LATER = 2
 """Fewest rows after an onset."""
-
-HYPOTHESES = ONSETS - FEWEST_LATER
-"""Onsets that are tested at each row."""
 
 ROWS = ONSETS + LARGEST_ORDER
 """Rows that may have the outlier: the response to one goes on after it."""
@@ -240,7 +237,7 @@ def design_limit(statistics: Array, learned: Prewhitening, arl0: float) -> float
         learned: prewhitening of the residual.
         arl0: run length without a fault, in rows.
     """
-    normal = widen_limit(-float(ndtri(0.5 / (arl0 * HYPOTHESES))), 1.0, learned)
+    normal = widen_limit(-float(ndtri(0.5 / (arl0 * (ONSETS - FEWEST_LATER)))), 1.0, learned)
     blocks = np.array_split(np.nan_to_num(statistics) ** 2, max(statistics.size // ONSETS, 1))
     largest = np.sort([float(block.max()) for block in blocks if block.size])
     upper = len(largest) // 2

@@ -48,12 +48,6 @@ SMALLEST = 5
 MOVEMENT_STEPS = 8
 """Steps in the mean that shows whether the signal was moving."""
 
-AT_REST = 0.25
-"""Share of the mean step in the quietest interval of the training: with less, the plant was coming to rest."""
-
-CONFIDENCE = 0.95
-"""Confidence of the bounds on shares."""
-
 STUCK = np.dtype(
     [
         ("limit", "f8"),  # most equal readings in a row without a fault
@@ -117,7 +111,7 @@ def take_reading(p: Any, value: float) -> bool:
 @jit
 def allowed_readings(p: Any) -> float:
     """Most equal readings in a row; infinite if the signal came to rest before them."""
-    moved = p.step_count == MOVEMENT_STEPS and movement(p) >= AT_REST * p.quietest
+    moved = p.step_count == MOVEMENT_STEPS and movement(p) >= 0.25 * p.quietest
     return float(p.limit) if moved else inf
 
 
@@ -253,12 +247,13 @@ def longest_ordinary_run(runs: dict[int, int], arl0: float) -> float:
     >>> longest_ordinary_run({999: 1}, 432_000)
     inf
     """
+    confidence = 0.95  # of the bounds on shares: so many trainings of 100 keep `arl0`
     readings = sum(count * (repeats + 1) for repeats, count in runs.items())
     if not readings:
         return inf
     longest = max(runs)
     repeated = sum(count * repeats for repeats, count in runs.items())
-    independent = _length(upper_bound(repeated, readings - 1, CONFIDENCE), arl0)
+    independent = _length(upper_bound(repeated, readings - 1, confidence), arl0)
     limits = [SMALLEST - 1.0, 2 * (longest + 1.0), independent]
     depth = 1
     while depth <= longest:
@@ -268,7 +263,7 @@ def longest_ordinary_run(runs: dict[int, int], arl0: float) -> float:
             break
         continued = sum(count * (repeats - depth) for repeats, count in deep.items())
         # Two bounds that hold together with the confidence of one (Bonferroni).
-        each = (1.0 + CONFIDENCE) / 2.0
+        each = (1.0 + confidence) / 2.0
         share = upper_bound(reached, readings, each)
         limits.append(depth + _length(upper_bound(continued, continued + reached, each), arl0 * share))
         depth *= 2

@@ -20,11 +20,9 @@ from reactorwatch.errors import InputError
 from reactorwatch.records.write import atomic_write, refuse_source
 from recorder import RecordedMessage, StoredMessage
 from recorder.files.index import LATEST_NS
-from recorder.files.metadata import METADATA, own_metadata, parse_gap
-from recorder.files.part_file import PART, is_locked, lock_orphan
 from recorder.files.reader import Damage, Reader, read_start, select_topics
-from recorder.files.recording import SourceFile, merge_messages, open_sources
-from recorder.files.writer import RecordingWriter
+from recorder.files.recording import SourceFile, merge_messages, open_sources, own_metadata, parse_gap
+from recorder.files.writer import METADATA, PART, RecordingWriter, is_locked, lock_orphan
 from recorder.keep import LATCHED_KINDS, FileNames, LatchedMessages
 from recorder.samples import content_of
 
@@ -34,7 +32,6 @@ RECOVERED = "recovered"
 """Name of the metadata record about the damage, in a recovered file."""
 DAMAGED = ".damaged"
 """Ending of an orphan that was recovered in part only; it is retained like a recording."""
-_MAX_LISTED = 5  # damages listed in a text; the others are counted
 
 
 @dataclass(frozen=True)
@@ -64,10 +61,10 @@ class RecoveryResult:
 
     @property
     def losses(self) -> str:
-        """Text about the lost parts; empty if there are none."""
-        texts = [str(damage) for damage in self.damages[:_MAX_LISTED]]
-        if len(self.damages) > _MAX_LISTED:
-            texts.append(f"{len(self.damages) - _MAX_LISTED} more places")
+        """Text about the lost parts, five of them and the number of the others; empty if there are none."""
+        texts = [str(damage) for damage in self.damages[:5]]
+        if len(self.damages) > len(texts):
+            texts.append(f"{len(self.damages) - len(texts)} more places")
         if self.orphans:
             texts.append(f"{self.orphans} messages of channels that are described nowhere")
         return "; ".join(texts)
@@ -275,9 +272,7 @@ def _latched_messages(sources: Sequence[SourceFile], window: Window, start_ns: i
     return latched.messages(start_ns)
 
 
-def _copy_metadata(
-    sources: Sequence[SourceFile], writer: RecordingWriter, received_ns: tuple[int, int] = (0, LATEST_NS)
-) -> None:
+def _copy_metadata(sources: Sequence[SourceFile], writer: RecordingWriter, received_ns: tuple[int, int]) -> None:
     """Copy metadata and attachments, equal ones once.
 
     Gaps are copied if they are within the time, and the metadata of this software are not copied.

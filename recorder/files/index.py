@@ -16,15 +16,7 @@ import lz4.frame
 import zstandard
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.records import (
-    AttachmentIndex,
-    Channel,
-    Chunk,
-    ChunkIndex,
-    MetadataIndex,
-    Schema,
-    Statistics,
-)
+from mcap.records import Channel, Chunk, ChunkIndex, MetadataIndex, Schema, Statistics
 from mcap.stream_reader import StreamReader
 from mcap.summary import Summary
 from mcap.writer import MCAP0_MAGIC
@@ -33,8 +25,7 @@ from reactorwatch.errors import InputError
 
 LATEST_NS = 2**64 - 1
 LARGEST_MB = "REACTORWATCH_LARGEST_CHUNK_MB"
-"""Environment variable that sets the largest chunk that is read."""
-DEFAULT_LARGEST_MB = 32.0
+"""Environment variable that sets the largest chunk that is read; 32 MB are several times what any writer makes."""
 TABLE_CURE = "the name of a table must end in .csv, .xlsx, .parquet or another ending of a table"
 """Cure for a table that is taken for a recording by its name."""
 FOOTER = struct.Struct("<BQQQI")
@@ -44,7 +35,6 @@ RECORD = struct.Struct("<BQ")
 FIRST_PRIVATE = 0x80
 """Opcodes from here on are private to other programs."""
 
-_MB = 1_000_000
 _IN_CHUNKS = frozenset({Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE})
 
 DAMAGE = (
@@ -87,30 +77,23 @@ def read_summary(path: Path, data: mmap.mmap) -> Summary:
     content = data[start:]
     if crc and zlib.crc32(content[: -len(MCAP0_MAGIC) - 4]) != crc:
         raise damage_error(path, "its index is damaged: the checksum differs")
-    try:
-        return _parse_summary(content)
-    except DAMAGE as error:
-        raise damage_error(path, "its index is damaged", error) from error
-
-
-def _parse_summary(content: bytes) -> Summary:
-    """Parse the records of an index and the footer after it; other kinds, such as chunks, are ignored."""
     summary = Summary()
     reader = StreamReader(io.BytesIO(content), skip_magic=True, emit_chunks=True, record_size_limit=len(content))
-    for record in reader.records:
-        match record:
-            case Schema():
-                summary.schemas[record.id] = record
-            case Channel():
-                summary.channels[record.id] = record
-            case ChunkIndex():
-                summary.chunk_indexes.append(record)
-            case MetadataIndex():
-                summary.metadata_indexes.append(record)
-            case AttachmentIndex():
-                summary.attachment_indexes.append(record)
-            case Statistics():
-                summary.statistics = record
+    try:
+        for record in reader.records:  # other kinds, such as chunks, are ignored
+            match record:
+                case Schema():
+                    summary.schemas[record.id] = record
+                case Channel():
+                    summary.channels[record.id] = record
+                case ChunkIndex():
+                    summary.chunk_indexes.append(record)
+                case MetadataIndex():
+                    summary.metadata_indexes.append(record)
+                case Statistics():
+                    summary.statistics = record
+    except DAMAGE as error:
+        raise damage_error(path, "its index is damaged", error) from error
     return summary
 
 
@@ -143,18 +126,18 @@ def largest_chunk_bytes() -> int:
     Raises:
         ValueError: the variable is not a positive number.
     """
-    text = os.environ.get(LARGEST_MB, str(DEFAULT_LARGEST_MB))
+    text = os.environ.get(LARGEST_MB, "32")
     try:
         largest_mb = float(text)
     except ValueError:
         largest_mb = -1.0
     if not 0.0 < largest_mb < float("inf"):
         raise ValueError(f"{LARGEST_MB} must be a positive number, got {text!r}")
-    return round(largest_mb * _MB)
+    return round(largest_mb * 1e6)
 
 
 def decompress(chunk: Chunk, indexed_bytes: int | None) -> bytes:
-    """Decompressed records of a chunk, of which the index claims `indexed_bytes`; None if there is no index.
+    """Decompressed records of a chunk, of which the index claims `indexed_bytes`; None: there is no index.
 
     Raises:
         ValueError: it is larger than the setting allows, not of the size that is claimed, or damaged. Errors of the
@@ -163,7 +146,7 @@ def decompress(chunk: Chunk, indexed_bytes: int | None) -> bytes:
     claimed, largest = chunk.uncompressed_size, largest_chunk_bytes()
     if claimed > largest:
         raise ValueError(
-            f"the chunk claims to hold {claimed / _MB:.1f} MB, and at most {largest / _MB:g} MB are read; "
+            f"the chunk claims to hold {claimed / 1e6:.1f} MB, and at most {largest / 1e6:g} MB are read; "
             f"{LARGEST_MB} sets another limit"
         )
     if indexed_bytes is not None and indexed_bytes != claimed:

@@ -15,7 +15,6 @@ import struct
 import zlib
 from collections import deque
 from collections.abc import Callable, Collection, Iterator
-from dataclasses import dataclass
 from operator import attrgetter
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -32,7 +31,7 @@ from reactorwatch.contract import keys
 from reactorwatch.contract.codec import PREFIX
 from reactorwatch.errors import InputError
 from reactorwatch.records.decode import wrap_read_errors
-from recorder import Channel, StoredMessage
+from recorder import StoredMessage
 from recorder.files.index import (
     DAMAGE,
     FIRST_PRIVATE,
@@ -45,10 +44,8 @@ from recorder.files.index import (
     is_indexed,
     read_summary,
 )
-from recorder.files.part_file import PART, open_recording
+from recorder.files.writer import LATCHED, PART, StoredChannel, open_recording
 
-LATCHED = "reactorwatch.repeated"
-"""Key in the metadata of a channel of latched messages, see `RecordedMessage.latched`."""
 Wanted = Callable[[str], bool]
 """Returns True for topics to read."""
 
@@ -77,14 +74,6 @@ _BEFORE_COMPRESSION = RECORD.size + 8 + 8 + 8 + 4 + 4  # bytes of a chunk before
 _NAME_LENGTH, _DATA_LENGTH = struct.Struct("<I"), struct.Struct("<Q")
 _INDEX = struct.Struct("<HI")  # channel of a message index, length of the rest
 _CHECKSUM = struct.Struct("<I")
-
-
-@dataclass(slots=True, eq=False, kw_only=True)
-class StoredChannel(Channel):
-    """Channel of a file that any program wrote, as it is described there."""
-
-    record: ChannelRecord
-    schema: Schema | None
 
 
 class Damage(NamedTuple):

@@ -2,18 +2,26 @@
 
 A schema or channel is in the chunk of its first message, as the library writes it, and outside of it, so that a
 damaged chunk does not leave later messages without a channel.
+
+The file of an incomplete recording is locked, so that no other process takes it for an orphan. Bytes are buffered in
+memory, and `drain` hands them to the operating system: only there a full disk shows. Drained bytes survive the process,
+synced bytes the machine. The lock ends with the process, so a file without a lock is an orphan.
 """
 
+import errno
+import fcntl
 import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import BinaryIO, Self
 
 from google.protobuf.descriptor_pb2 import FileDescriptorProto, FileDescriptorSet
 from mcap.data_stream import RecordBuilder
+from mcap.opcode import Opcode
 from mcap.records import Attachment, Schema
 from mcap.records import Channel as ChannelRecord
 from mcap.well_known import MessageEncoding, SchemaEncoding
@@ -24,14 +32,161 @@ from reactorwatch.contract.codec import message_type
 from reactorwatch.errors import InputError
 from reactorwatch.version import build_metadata, this_build
 from recorder import Channel, RecordedMessage, StoredMessage
-from recorder.files.metadata import METADATA
-from recorder.files.part_file import PART, PartFile, is_locked
-from recorder.files.reader import LATCHED, StoredChannel
 from recorder.keep import MAX_CHANNELS, channel_of
 from recorder.samples import content_of
 
-MAX_SEQUENCE = 2**32 - 1
-"""Largest sequence number in MCAP; larger ones wrap around to 0."""
+PART = ".part"
+"""Ending of an incomplete recording."""
+DELETED = "its file was deleted"
+
+
+class PartFile:
+    """New append-only file, with a lock; the stream of the library's writer.
+
+    Args:
+        path: the file; it must not exist.
+
+    Attributes:
+        chunk_end: end of the last chunk that was written, from the start of the file.
+        drained: number of bytes handed to the operating system.
+
+    Raises:
+        OSError: it cannot be created.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.chunk_end = self.drained = 0
+        self._raw = path.open("xb", buffering=0)
+        fcntl.flock(self._raw, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        self._pending = bytearray()
+
+    def write(self, data: bytes) -> int:
+        """Buffer bytes; the library writes a chunk record in one call."""
+        self._pending += data
+        if data[:1] == Opcode.CHUNK.to_bytes():
+            self.chunk_end = self.tell()
+        return len(data)
+
+    def tell(self) -> int:
+        """Number of bytes written, buffered ones included."""
+        return self.drained + len(self._pending)
+
+    def flush(self) -> None:
+        """Do nothing: the library's writer calls it, and must never meet a full disk."""
+
+    def drain(self) -> None:
+        """Hand the buffer to the operating system; after an error it may be called again.
+
+        Raises:
+            OSError: the write failed, for example on a full disk, perhaps after part of the buffer; or the file was
+                deleted, so that writes would succeed and be lost.
+        """
+        while self._pending:
+            taken = self._append(self._pending)
+            self.drained += taken
+            del self._pending[:taken]
+        if self._is_deleted:
+            raise OSError(errno.ENOENT, DELETED)
+
+    def sync(self) -> None:
+        """Drain, and wait until all bytes are on the disk.
+
+        Raises:
+            OSError: as `drain`, or the sync failed.
+        """
+        self.drain()
+        os.fsync(self._raw.fileno())
+
+    def finish(self, path: Path) -> None:
+        """Sync, rename to `path` while the lock is held, and close: a complete file is on the disk.
+
+        Raises:
+            OSError: as `sync`, or it cannot be renamed; it is closed under its old name.
+        """
+        try:
+            self.sync()
+            self.path.rename(path)
+        finally:
+            self.abandon()
+
+    def abandon(self) -> None:
+        """Close and drop the buffer; a second call does nothing."""
+        self._pending.clear()
+        self._raw.close()
+
+    @property
+    def closed(self) -> bool:
+        """True after `finish` or `abandon`."""
+        return self._raw.closed
+
+    @property
+    def _is_deleted(self) -> bool:
+        """True if no file or another file has its name."""
+        try:
+            return not os.path.samestat(os.fstat(self._raw.fileno()), self.path.stat())
+        except (FileNotFoundError, NotADirectoryError):
+            return True
+
+    def _append(self, data: bytearray) -> int:
+        return self._raw.write(data)
+
+
+def open_recording(path: Path) -> BinaryIO:
+    """Open a file of a recording to read it; if its recorder completed it meanwhile, under its complete name.
+
+    Raises:
+        OSError: it cannot be opened.
+    """
+    try:
+        return path.open("rb")
+    except FileNotFoundError:
+        if path.suffix != PART:
+            raise
+        return path.with_suffix("").open("rb")
+
+
+def is_locked(path: Path) -> bool:
+    """True if a running process writes the file; False if it does not exist."""
+    try:
+        with lock_orphan(path):
+            return False
+    except InputError:
+        return True
+    except FileNotFoundError:
+        return False
+
+
+@contextmanager
+def lock_orphan(path: Path) -> Iterator[BinaryIO]:
+    """Open and lock an orphan within the context.
+
+    Raises:
+        InputError: a process writes it.
+        OSError: it cannot be opened, or was replaced since.
+    """
+    with path.open("rb") as stream:
+        try:
+            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise InputError(f"{path}: is still being written; stop its recorder first") from error
+        if not os.path.samestat(os.fstat(stream.fileno()), path.stat()):
+            raise FileNotFoundError(f"{path}: is another file by now")
+        yield stream
+
+
+METADATA = "reactorwatch"
+"""Name of the record that a writer of this software starts a file with."""
+LATCHED = "reactorwatch.repeated"
+"""Key in the metadata of a channel of latched messages, see `RecordedMessage.latched`."""
+
+
+@dataclass(slots=True, eq=False, kw_only=True)
+class StoredChannel(Channel):
+    """Channel of a file that any program wrote, as it is described there."""
+
+    record: ChannelRecord
+    schema: Schema | None
 
 
 class WriteError(InputError):
@@ -119,7 +274,7 @@ class RecordingWriter:
         number = self._channels.get(channel)
         if number is None:
             number = self._channels[channel] = self._register(channel)
-        sequence = stored.sequence & MAX_SEQUENCE
+        sequence = stored.sequence & 0xFFFF_FFFF  # 32 bits in MCAP: larger ones wrap around to 0
         self._add_message(number, stored.log_time_ns, stored.payload, stored.publish_time_ns, sequence)
         self._in_chunk += 1
         if self._stream.chunk_end != self._chunk_end:  # the chunk was full
@@ -209,7 +364,12 @@ class RecordingWriter:
 
     def _register(self, channel: Channel) -> int:
         if isinstance(channel, StoredChannel):
-            return self._copy_channel(channel)
+            record, described = channel.record, channel.schema
+            number = self._schema(described.name, described.encoding, described.data) if described else 0
+            name = (record.topic, record.message_encoding, number, *sorted(record.metadata.items()))
+            if name not in self._copies:  # two readers have objects of their own for equal channels
+                self._copies[name] = self._add_channel(record.topic, record.message_encoding, number, record.metadata)
+            return self._copies[name]
         metadata = {LATCHED: "true"} if channel.latched else {}
         kind = message_type(channel.encoding) if channel.is_readable else None
         if kind is None:
@@ -226,14 +386,6 @@ class RecordingWriter:
         number = self._writer.register_channel(topic, encoding, schema, metadata)
         self._write_outside(ChannelRecord(number, topic, encoding, metadata, schema))
         return number
-
-    def _copy_channel(self, channel: StoredChannel) -> int:
-        record, schema = channel.record, channel.schema
-        number = self._schema(schema.name, schema.encoding, schema.data) if schema else 0
-        name = (record.topic, record.message_encoding, number, *sorted(record.metadata.items()))
-        if name not in self._copies:
-            self._copies[name] = self._add_channel(record.topic, record.message_encoding, number, record.metadata)
-        return self._copies[name]
 
     def _schema(self, name: str, encoding: str, data: bytes) -> int:
         described = (name, encoding, data)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.steady_state import SteadyState, steady_states
-from recorder.columns import RunColumns, Times, Values, find_model
+from recorder.columns import RunColumns, Times, Values
 from recorder.panels.base import (
     ALARM,
     FAULT,
@@ -27,15 +27,10 @@ from recorder.panels.base import (
     PlanePath,
     PlanePlot,
 )
+from recorder.panels.signals import find_model
 
 MAX_POINTS = 4000
-"""Largest number of points of a path in a segment; beyond it only extreme rows are drawn."""
-MAX_BRANCH_POINTS = 32
-"""Largest number of points of a branch."""
-FARTHEST = 2.0
-"""Largest distance between neighbouring points of a branch, in scales of the states."""
-MARGIN = 0.05
-"""Share of the mean level of the input by which the drawn branch extends to either side at least."""
+"""Largest number of points of a path in a segment, as many as a screen can show; beyond it extreme rows are drawn."""
 
 _ACTIVE = (messages.ALARM_STATE_UNACKNOWLEDGED, messages.ALARM_STATE_ACKNOWLEDGED)
 
@@ -51,7 +46,7 @@ def draw(run: RunColumns) -> tuple[PlanePlot, ...]:
     if not (level.rows and np.isfinite(x).any()):
         return ()
     operating = run.context.levels.get(input_.name, level.mean)
-    around = MARGIN * abs(operating)
+    around = 0.05 * abs(operating)  # the branch is drawn to either side at least
     ends = (min(level.lowest, operating - around), max(level.highest, operating + around))
     branch = operating_branch(model, *ends, operating)
     rounded = float(f"{operating:.4g}")
@@ -90,7 +85,7 @@ def operating_branch(model: ProcessModel, lowest: float, highest: float, level: 
         return []
     lowest, highest = max(lowest, bounds.lower), min(highest, bounds.upper)
     step = 10.0 ** math.floor(math.log10(max(abs(level), 1e-9))) / 40
-    while (highest - lowest) / step > MAX_BRANCH_POINTS:
+    while (highest - lowest) / step > 32:  # points, each of which takes a solution of the equations
         step *= 2.0
     first, last, start = math.ceil(lowest / step), math.floor(highest / step), round(level / step)
     operating = steady_states_at(model, start * step)[-1:]
@@ -108,7 +103,7 @@ def _continue_branch(model: ProcessModel, state: SteadyState, levels: list[float
     for level in levels:
         candidates = steady_states_at(model, level)
         distances = [float(np.linalg.norm((item.state - state.state) / scale)) for item in candidates]
-        if not candidates or min(distances) > FARTHEST:
+        if not candidates or min(distances) > 2.0:  # scales of the states: it is another branch
             break
         state = candidates[int(np.argmin(distances))]
         branch.append(state)

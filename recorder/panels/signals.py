@@ -3,15 +3,21 @@
 The panel of models shows the parameters of the adaptive, frozen and reference model, noise levels, and excitation: the
 ratio of the smallest to the largest singular value of the scaled regressor. Where it is near 0, the estimated
 parameters are noise.
+
+Signals have meanings and roles from their process, or from the catalogue of processes.
 """
 
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from reactorwatch.contract import messages_pb2 as messages
+from reactorwatch.description.process import Process
+from reactorwatch.process import MODELS as PROCESS_MODELS
+from reactorwatch.process.model import ProcessModel
 from recorder.columns import (
     ADAPTIVE,
     EQUATIONS,
@@ -22,8 +28,6 @@ from recorder.columns import (
     RunColumns,
     Times,
     Values,
-    signal_roles,
-    signal_title,
     times_of,
 )
 from recorder.panels.base import (
@@ -46,9 +50,64 @@ from recorder.panels.base import (
 
 _ROLES = ("output", "setpoint", "input", "mode", "label")
 """Roles in the order of their plots."""
-BESIDE = SEVERAL[3]
-"""Colour of predictions that are not those of the reference."""
 _ROLE_COLOURS = {"setpoint": SETPOINT, "input": INPUT, "mode": QUIET, "label": QUIET}
+
+
+def signal_title(name: str, unit: str, process: Process | None = None) -> str:
+    """Name of a signal, with its meaning if its process has a variable of that name.
+
+    Without a process, it is any of the catalogue whose variable has this unit, too.
+    """
+    for model in _models_of(process):
+        for item in (*model.inputs, *model.states):
+            if item.name == name and (item.unit == unit or process is not None):
+                return f"{name}: {item.meaning}" if item.meaning else name
+    return name
+
+
+def signal_roles(units: Mapping[str, str], process: Process | None = None) -> dict[str, str]:
+    """Roles of signals by name: those of the process in its order, then all others as outputs.
+
+    Args:
+        units: units of the signals, by name; empty: unknown.
+        process: process of the signals; None: the one of the catalogue that has all of them, or all of whose signals
+            are there.
+    """
+    if process is not None:
+        roles = {signal.name: signal.role for signal in process.signals}
+    elif (model := find_model(units) or _find_model_with(units)) is not None:
+        roles = {name: "input" if name in model.input_names else "output" for name in model.units}
+    else:
+        roles = {}
+    known = {name: role for name, role in roles.items() if name in units}
+    return known | {name: "output" for name in units if name not in roles}
+
+
+def find_model(units: Mapping[str, str], process: Process | None = None) -> ProcessModel | None:
+    """Equations, of the catalogue without a process, whose inputs and outputs are all present with the same units."""
+    return next((model for model in _models_of(process) if model.units.items() <= units.items()), None)
+
+
+def _find_model_with(units: Mapping[str, str]) -> ProcessModel | None:
+    """Model of the catalogue that has all of the signals, none of them in another unit."""
+    for model in _models():
+        if all(name in model.units and unit in ("", model.units[name]) for name, unit in units.items()):
+            return model
+    return None
+
+
+def _models_of(process: Process | None) -> tuple[ProcessModel, ...]:
+    """Equations of a process; without its own, those of the catalogue under its name."""
+    if process is None:
+        return _models()
+    if process.model is not None:
+        return (process.model,)
+    return tuple(model for model in _models() if model.name == process.name)
+
+
+@cache
+def _models() -> tuple[ProcessModel, ...]:
+    return tuple(build() for build in PROCESS_MODELS)
 
 
 def draw_overview(run: RunColumns) -> tuple[View, ...]:
@@ -111,7 +170,7 @@ def _plot(run: RunColumns, name: str, role: str, setpoints: Sequence[str]) -> Ti
         ]
     if (beside := run.estimates_beside.get(name)) is not None:
         label = "arx, for comparison"
-        series.append(Series("predicted beside", beside.time_ns, beside.prediction, BESIDE, width=0.8, legend=label))
+        series.append(Series("predicted beside", beside.time_ns, beside.prediction, RESIDUAL, width=0.8, legend=label))
     if rebuilt is not None:
         series.append(Series("reconstructed", rebuilt.time_ns, rebuilt.value, RESIDUAL, width=1.5))
     unit = run.units.get(name, "")
@@ -126,11 +185,6 @@ def _limits(time_ns: Times, lower: Values, upper: Values) -> tuple[Series, Serie
 
 
 OVERVIEW = Panel("Overview", draw_overview, arranged="beside")
-
-
-MAX_EXCURSION = 25.0
-"""Largest distance of a drawn statistic from the centre, in distances of the limit; beyond it the limits would be
-invisible."""
 
 
 def draw_charts(run: RunColumns) -> tuple[TimePlot, ...]:
@@ -153,8 +207,9 @@ def _residual(name: str, unit: str, estimated: EstimateColumns) -> TimePlot:
 
 
 def _chart(name: str, chart: ChartColumns) -> TimePlot:
-    far = np.maximum(np.abs(chart.upper_limit - chart.centre), np.abs(chart.lower_limit - chart.centre)) * MAX_EXCURSION
-    highest, lowest = chart.centre + far, chart.centre - far
+    distance = np.maximum(np.abs(chart.upper_limit - chart.centre), np.abs(chart.lower_limit - chart.centre))
+    # a statistic 25 distances of the limit away is at the edge of the plot: beyond it the limits would be invisible
+    highest, lowest = chart.centre + 25.0 * distance, chart.centre - 25.0 * distance
     edge = np.where(chart.statistic > highest, highest, np.where(chart.statistic < lowest, lowest, np.nan))
     series = [
         *_limits(chart.time_ns, chart.lower_limit, chart.upper_limit),

@@ -7,9 +7,10 @@ from operator import attrgetter
 import numpy as np
 
 from reactorwatch.contract import messages_pb2 as messages
-from reactorwatch.contract.alarm_text import suspects_text
-from reactorwatch.contract.promise_text import describe_sizes, promise_fields
 from reactorwatch.records.record import to_minutes
+from reactorwatch.results.promise import state_promise
+from reactorwatch.sentences.alarm import suspects_text
+from reactorwatch.sentences.promise import describe_sizes
 from recorder.columns import LISTED, RunColumns, times_of
 from recorder.panels.base import (
     ALARM,
@@ -109,7 +110,7 @@ def _promise_events(run: RunColumns) -> list[Event]:
     before: tuple[object, ...] = ()
     for item in run.promises:
         holds = item.kept and not item.drifted
-        power = [describe_sizes(each) for each in promise_fields(item)["power"]]
+        power = [describe_sizes(each) for each in state_promise(item)[1]]
         stated = (item.found, holds, power)
         if stated == before:
             continue
@@ -143,7 +144,9 @@ def draw_health(run: RunColumns) -> tuple[View, ...]:
         for node, reports in sorted(run.health.items())
     )
     lags = _health_lines(run, attrgetter("lag_ms"))
-    problems = _health_lines(run, _problems, held=True)
+    problems = _health_lines(
+        run, lambda item: item.lost + item.late + item.refused + item.duplicated + item.out_of_order, held=True
+    )
     return (
         StateLines("Node phases", lanes, _PHASES),
         TimePlot("Lag between receipt and the end of processing", "ms", lags),
@@ -151,13 +154,9 @@ def draw_health(run: RunColumns) -> tuple[View, ...]:
     )
 
 
-def _problems(report: messages.Health) -> float:
-    return float(report.lost + report.late + report.refused + report.duplicated + report.out_of_order)
-
-
 def _health_lines(run: RunColumns, of: Callable[[messages.Health], float], *, held: bool = False) -> tuple[Series, ...]:
     return tuple(
-        Series(node, times_of(reports), np.array([of(item) for item in reports]), colour, held=held)
+        Series(node, times_of(reports), np.array([of(item) for item in reports], np.float64), colour, held=held)
         for (node, reports), colour in zip(sorted(run.health.items()), cycle(SEVERAL), strict=False)
     )
 

@@ -11,19 +11,26 @@ import numpy as np
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import encode
 from reactorwatch.contract.messages_pb2 import Sample
-from reactorwatch.description.find import DEFAULT_CHOICE, ProcessChoice
 from reactorwatch.description.process import Process
-from reactorwatch.description.read import convert_to_process, read_signals
+from reactorwatch.description.read import DEFAULT_CHOICE, ProcessChoice, convert_to_process, read_signals
 from reactorwatch.errors import InputError
 from reactorwatch.records.decode import is_table
 from reactorwatch.records.file_format import GUESS, FileFormat
 from reactorwatch.records.record import LONGEST_MIN, MINUTE_NS, Record, join_files, join_runs, to_time_ns
 from reactorwatch.records.write import atomic_write, refuse_source, write_table
 from recorder import RecordedMessage
-from recorder.columns import signal_roles
-from recorder.files.metadata import CLOCK, NO_CLOCK, PROCESS, ZERO_NS, process_metadata
-from recorder.files.recording import Recording, has_clock, zero_from
+from recorder.files.recording import (
+    CLOCK,
+    NO_CLOCK,
+    PROCESS,
+    ZERO_NS,
+    Recording,
+    has_clock,
+    process_metadata,
+    zero_from,
+)
 from recorder.files.writer import RecordingWriter
+from recorder.panels.signals import signal_roles
 from recorder.samples import RunSplitter, SampleSeries, decode_messages
 from recorder.tools.player import samples_of
 

@@ -11,13 +11,12 @@ from reactorwatch.description.process import Process
 from reactorwatch.errors import InputError
 from reactorwatch.runtime.reorder_buffer import Gap
 from recorder import RecordedMessage
-from recorder.files.metadata import gaps_of, own_metadata, processes_in
 from recorder.files.reader import Reader, read_start
-from recorder.files.recording import Recording, zero_from
+from recorder.files.recording import Recording, gaps_of, own_metadata, processes_in, zero_from
 from recorder.samples import Run, RunSplitter, content_of
 
 MAX_GAPS = 1000
-"""Gaps that are listed; more are counted only."""
+"""Gaps that are listed, more than is read; the others are counted."""
 
 
 @dataclass

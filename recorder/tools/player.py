@@ -15,14 +15,10 @@ from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Body, Publication
 from reactorwatch.records.record import MINUTE_NS, NEVER_NS, Record, to_time_ns
-from reactorwatch.runtime.node import Node
+from reactorwatch.runtime.bus import Node
 from recorder import RecordedMessage
 from recorder.keep import STATES
 from recorder.samples import RunSplitter, decode_messages
-
-LONG_WAIT_NS = MINUTE_NS
-JUMP = 2.0
-"""Spacings of rows beyond which the time to the next row is a jump of the recorded clock."""
 
 BATCH = 256
 """Largest number of messages published in one tick, so that the loop notices a stop."""
@@ -178,7 +174,7 @@ class Player(Node):
             due.append(self._take(*self._next))
         if due and self._next is not None and self._is_jump and not self.paused:
             wait_ns = self.next_tick_ns() - now_ns
-            if wait_ns > LONG_WAIT_NS:
+            if wait_ns > MINUTE_NS:
                 self._on_wait(wait_ns / 1e9)
         return due
 
@@ -240,7 +236,7 @@ class Player(Node):
         self._next = next(self._tape, None)
         if self._next is not None:
             spacing_ns = self._next[1] - time_ns
-            self._is_jump = spacing_ns > JUMP * self._spacing_ns
+            self._is_jump = spacing_ns > 2 * self._spacing_ns  # the recorded clock was set, or the plant stood still
             self._spacing_ns = spacing_ns or self._spacing_ns
         elif self._loop:
             self._tape = _schedule(self._open_tape())

@@ -19,8 +19,7 @@ import structlog
 
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Publication
-from reactorwatch.description.find import ProcessChoice
-from reactorwatch.description.read import read_signals
+from reactorwatch.description.read import ProcessChoice, read_signals
 from reactorwatch.errors import InputError
 from reactorwatch.records.decode import is_table
 from reactorwatch.records.record import NEVER_NS, to_time_ns
@@ -37,10 +36,6 @@ from recorder.tools.player import EVERYTHING, SAMPLES, Player, filter_playable, 
 log = structlog.get_logger()
 
 NODE = "replay"
-REFRESH_S = 0.25
-RATES = (1e-3, 1e6)
-"""Slowest and fastest rate that keys set."""
-
 HELP = "space: pause, right: next row, up and down: rate"
 
 _KEYS = re.compile(rb" |\x1b[\[O]([ABC])")
@@ -86,7 +81,7 @@ def _is_in_foreground() -> bool:
 def _read_keys(player: Player, loop: EventLoop, keyboard: int, end: int) -> None:
     """Hand keys to the loop, and refresh the line, until `end` is closed or the terminal is."""
     while True:
-        ready, _, _ = select.select([keyboard, end], [], [], REFRESH_S)
+        ready, _, _ = select.select([keyboard, end], [], [], 0.25)
         if end in ready:
             return
         if keyboard in ready:
@@ -105,8 +100,7 @@ def _act(player: Player, key: bytes, now_ns: int) -> list[Publication]:
     if key == _SPACE:
         player.set_pace(now_ns, paused=not player.paused)
     elif key in (_UP, _DOWN):
-        slowest, fastest = RATES
-        player.set_pace(now_ns, rate=min(max(player.rate * (2.0 if key == _UP else 0.5), slowest), fastest))
+        player.set_pace(now_ns, rate=min(max(player.rate * (2.0 if key == _UP else 0.5), 1e-3), 1e6))
     else:
         return player.step(now_ns)
     return []

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 from reactorwatch.axis import Axis, axis
 from recorder.columns import RunColumns, Times, Values
 from recorder.panels.base import (
+    LIMIT,
     Arrangement,
     Box,
     EventLog,
@@ -42,17 +43,10 @@ APPLICATION = "reactorwatch"
 RUN_TIME = "run time"
 SAMPLE_TIME = "sample time"
 BATCH_ROWS = 8192
-"""Points of a line that are sent at once."""
+"""Points of a line that are sent at once, which bounds the memory of a message to Rerun."""
 
 _ENDLESS = rr.TimeRangeBoundary.infinite()
 _WHOLE_RUN = rr.TimeRange(start=_ENDLESS, end=_ENDLESS)
-_LANES_SHARE = 1.3
-"""Height of lanes, in heights of a time plot."""
-
-_WIDTH, _HEIGHT = 400.0, 300.0  # page size of the box that sets the scales
-_AXIS_COLOUR = (90, 90, 90)
-_LABEL_COLOUR = (150, 150, 150)
-_BELOW, _PATHS, _CURVES, _MARKS = 0.0, 10.0, 30.0, 100.0  # drawing order
 
 
 def path_of(*parts: str) -> str:
@@ -77,11 +71,11 @@ class _Frame(NamedTuple):
         return across and self.y_axis.lower <= shown.y_lower and shown.y_upper <= self.y_axis.upper
 
     def page(self, x: Values, y: Values) -> NDArray[np.float64]:
-        """Page coordinates, shape (points, 2); the second one points downwards, as on a screen."""
+        """Coordinates on a page where the box is 400 by 300, shape (points, 2); the second one points down."""
         box = self.box
         across = (x - box.x_lower) / ((box.x_upper - box.x_lower) or 1.0)
         up = (y - box.y_lower) / ((box.y_upper - box.y_lower) or 1.0)
-        return np.column_stack([across * _WIDTH, (1.0 - up) * _HEIGHT])
+        return np.column_stack([400.0 * across, 300.0 * (1.0 - up)])
 
     def strips(self, line: PlanePath) -> list[NDArray[np.float64]]:
         """Parts of a path between its gaps, on the page."""
@@ -223,7 +217,7 @@ def _container(title: str, arranged: Arrangement, placed: Sequence[_PlacedView])
 
 def _column(placed: Sequence[_PlacedView], *id_names: str, name: str | None = None) -> rrb.Container:
     """Views one below the other, so that one time is one vertical line."""
-    shares = [_LANES_SHARE if isinstance(item.view, StateLines) else 1.0 for item in placed]
+    shares = [1.3 if isinstance(item.view, StateLines) else 1.0 for item in placed]  # lanes have labels beside them
     return _with_stable_id(rrb.Vertical(*(item.shown for item in placed), row_shares=shares, name=name), *id_names)
 
 
@@ -340,7 +334,7 @@ class Renderer:
             self._send(lane, np.array(line.time_ns, np.int64), zero_ns, columns)
 
     def _draw_plane(self, path: str, plane: PlanePlot, zero_ns: int) -> None:
-        """Draw a plane, or add a segment to it."""
+        """Draw a plane, or add a segment to it: axes below, then paths, curves and marks."""
         frame = self.layout.frames[path]
         self._draw_axes(path, plane, frame)
         for order, line in enumerate(plane.paths):
@@ -348,14 +342,14 @@ class Renderer:
             if strips:
                 where = path + path_of(line.name)
                 style = rr.LineStrips2D.from_fields(
-                    colors=[line.colour], radii=rr.Radius.ui_points(line.width / 2), draw_order=_PATHS + order
+                    colors=[line.colour], radii=rr.Radius.ui_points(line.width / 2), draw_order=10.0 + order
                 )
                 self._log_static(where, (line.colour, line.width), style)
                 columns = rr.LineStrips2D.columns(strips=strips).partition([len(strips)])
                 self._send(where, np.array([plane.time_ns], np.int64), zero_ns, columns)
         for line in plane.curves:
             radius = rr.Radius.ui_points(line.width / 2)
-            curve = rr.LineStrips2D(frame.strips(line), colors=[line.colour], radii=radius, draw_order=_CURVES)
+            curve = rr.LineStrips2D(frame.strips(line), colors=[line.colour], radii=radius, draw_order=30.0)
             self._log_static(path + path_of(line.name), np.concatenate([line.x, line.y]).tobytes(), curve)
         if plane.marks:
             self._log_static(path + path_of("marks"), plane.marks, _points(plane.marks, frame))
@@ -372,7 +366,7 @@ class Renderer:
         lines = [[[at, top], [at, bottom]] for at, _ in x_ticks] + [[[left, at], [right, at]] for _, at in y_ticks]
         lines.append([[left, top], [right, top], [right, bottom], [left, bottom], [left, top]])
         radius = rr.Radius.ui_points(0.4)
-        grid = rr.LineStrips2D(lines, colors=[_AXIS_COLOUR], radii=radius, draw_order=_BELOW)
+        grid = rr.LineStrips2D(lines, colors=[(90, 90, 90)], radii=radius, draw_order=0.0)
         self._log_static(path + path_of("axes"), key, grid)
         texts = {
             **{(at, bottom + 0.05 * height): text for (at, _), text in zip(x_ticks, x_axis.labels, strict=True)},
@@ -386,7 +380,7 @@ class Renderer:
             list(texts),
             labels=list(texts.values()),
             show_labels=True,
-            colors=[_LABEL_COLOUR],
+            colors=[LIMIT],
             radii=rr.Radius.ui_points(0.0),
         )
         self._log_static(path + path_of("axis labels"), (key, plane.note), labels)
@@ -399,5 +393,5 @@ def _points(marks: Sequence[PlaneMark], frame: _Frame) -> rr.Points2D:
         show_labels=True,
         colors=[mark.colour for mark in marks],
         radii=rr.Radius.ui_points(6.0),
-        draw_order=_MARKS,
+        draw_order=100.0,
     )

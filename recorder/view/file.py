@@ -26,8 +26,6 @@ from recorder.panels import PANELS
 from recorder.panels.base import Colour, Panel, Series, TimePlot, View
 from recorder.view.drawing import APPLICATION, SAMPLE_TIME, Renderer
 
-_PIPE_BYTES = 65_536
-
 DIAGNOSIS = "Diagnosis"
 """Title of the tab of a diagnosis."""
 
@@ -105,10 +103,10 @@ def _pipe_to(path: Path) -> Iterator[Path]:
         with pipe.open("rb", buffering=0) as source:
             try:
                 with path.open("wb") as file:
-                    shutil.copyfileobj(source, file, _PIPE_BYTES)
+                    shutil.copyfileobj(source, file)
             except OSError as error:
                 failed.append(error)
-                while source.read(_PIPE_BYTES):  # so that the writer never blocks
+                while source.read(65_536):  # so that the writer never blocks
                     pass
 
     with tempfile.TemporaryDirectory() as folder:

@@ -18,8 +18,7 @@ from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Encoded, Publication, encode, encode_message, encoding_of
 from reactorwatch.contract.messages_pb2 import Alarm
 from reactorwatch.description.process import Process
-from reactorwatch.runtime.bus import Bus
-from reactorwatch.runtime.node import Node
+from reactorwatch.runtime.bus import Bus, Node
 from recorder.columns import LISTED, SEGMENT_MESSAGES, RunReader
 from recorder.panels import PANELS
 from recorder.samples import content_of
@@ -28,13 +27,14 @@ from recorder.view.drawing import Renderer
 _ALARM = encoding_of(Alarm)
 
 DRAW_INTERVAL_NS = 500_000_000
+"""Twice a second looks live; to draw message by message costs more than a viewer can take of a fast plant."""
 ZERO_TIMEOUT_NS = 15_000_000_000
 """Three times the usual period of health reports."""
 MAX_REMEMBERED = 10_000
-"""Stored changes of alarms, so that a listed one is not drawn twice."""
+"""Stored changes of alarms, so that a listed one is not drawn twice; bounded, as a run has no end."""
 
-REPLY_TIMEOUT_S = 5.0
-RETRY_S = 1.0
+REPLY_TIMEOUT_S, RETRY_S = 5.0, 1.0
+"""A node replies within milliseconds; one that has just been started may need some seconds, and is asked again."""
 COMMANDS = {"monitor": "list_alarms", "recorder": keys.LIST_RECORDER_ALARMS}
 """Commands that list alarms, by the node that replies."""
 

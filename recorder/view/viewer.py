@@ -25,8 +25,7 @@ from reactorwatch.errors import InputError
 from reactorwatch.runtime import bus_zenoh
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.event_loop import EventLoop, StopSignal, stop_on_signals
-from reactorwatch.runtime.http_guard import GuardedPort
-from reactorwatch.runtime.loopback import free_port
+from reactorwatch.runtime.http_pages import GuardedPort, free_port
 from recorder.view.drawing import APPLICATION
 from recorder.view.live import HistoryQuery, LiveDashboard, query_history
 
@@ -35,9 +34,6 @@ SCREENS = ("WAYLAND_DISPLAY", "WAYLAND_SOCKET", "DISPLAY")  # those that winit r
 CLEAN_EXIT_CODES = (None, 0, 130, -signal.SIGINT, -signal.SIGTERM)
 """Codes of a viewer that runs, was closed, or was terminated together with this process."""
 LOOPBACK = ("127.0.0.1", "::1")
-START_TIMEOUT_S = 30.0
-POLL_S = 0.1
-EXIT_TIMEOUT_S = 5.0
 
 
 def viewer_program() -> Path:
@@ -74,7 +70,7 @@ def viewer(
         finally:
             process.terminate()
             try:
-                process.wait(EXIT_TIMEOUT_S)
+                process.wait(5.0)
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.wait()
@@ -115,7 +111,9 @@ def show(
         _check_free(target.bind, port)
     # The viewer serves a page to every host that a request names, so a guard is in front of it.
     page, data = (free_port(), free_port()) if target.web else ports
-    arguments = ("--serve-web", "--web-viewer-port", str(page), *_origins(target, ports[0])) if target.web else ()
+    # an option for pages of other machines that may read the data; those of this machine always may
+    origins = () if target.bind in LOOPBACK else ("--cors-allow-origin", f"http://*:{ports[0]}")
+    arguments = ("--serve-web", "--web-viewer-port", str(page), *origins) if target.web else ()
     bind = LOOPBACK[0] if target.web else target.bind
     with contextlib.ExitStack() as stack:
         folder = stack.enter_context(tempfile.TemporaryDirectory())
@@ -188,18 +186,13 @@ def _in_url(address: str) -> str:
     return f"[{address}]" if ":" in address else address
 
 
-def _origins(target: DisplayTarget, page: int) -> tuple[str, ...]:
-    """Option for pages of other machines that may read the data; those of this machine always may."""
-    return () if target.bind in LOOPBACK else ("--cors-allow-origin", f"http://*:{page}")
-
-
 def _wait_for(process: subprocess.Popen[bytes], port: int, bind: str, target: DisplayTarget, log: Path) -> None:
     """Wait until the viewer listens at a port.
 
     Raises:
         InputError: it has exited, or does not listen in time.
     """
-    deadline = time.monotonic() + START_TIMEOUT_S
+    deadline = time.monotonic() + 30.0
     while time.monotonic() < deadline:
         try:
             with socket.create_connection((_reachable_address(bind), port), timeout=1.0):
@@ -207,11 +200,11 @@ def _wait_for(process: subprocess.Popen[bytes], port: int, bind: str, target: Di
         except OSError:
             pass
         try:
-            code = process.wait(POLL_S)
+            code = process.wait(0.1)
         except subprocess.TimeoutExpired:
             continue
         raise _exit_error(code, target, log)
-    raise InputError(f"the viewer does not listen at {bind}:{port} after {START_TIMEOUT_S:g} s")
+    raise InputError(f"the viewer does not listen at {bind}:{port} after 30 s")
 
 
 def _exit_error(code: int, target: DisplayTarget, log: Path) -> InputError:

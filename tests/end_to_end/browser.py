@@ -73,6 +73,11 @@ class Browser:
         features = [{"name": "prefers-color-scheme", "value": scheme}]
         self._ask("Emulation.setEmulatedMedia", on=self._session, features=features)
 
+    def emulate_print(self, width: int) -> None:
+        """Lay the page out as on paper of that width, in pixels."""
+        self.resize(width, 1000)
+        self._ask("Emulation.setEmulatedMedia", on=self._session, media="print")
+
     def evaluate(self, expression: str) -> Any:
         """The value of a JavaScript expression in the page."""
         found = self._ask("Runtime.evaluate", on=self._session, expression=expression, returnByValue=True)

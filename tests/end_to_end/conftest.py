@@ -10,7 +10,7 @@ import pytest
 
 from reactorwatch.runtime.bus_zenoh import ZenohBus, router
 from reactorwatch.runtime.config import BusConfig
-from reactorwatch.runtime.loopback import free_endpoint
+from reactorwatch.runtime.http_pages import free_endpoint
 from tests.running import Command as Command
 
 REACTORWATCH = str(Path(sys.executable).with_name("reactorwatch"))

@@ -11,10 +11,10 @@ import pytest
 import typer.main
 
 from reactorwatch.cli.main import app
-from reactorwatch.description.find import find_process
+from reactorwatch.description.read import find_process
 from reactorwatch.process.extended_model import parse_extended_model
 from reactorwatch.runtime.config import SECTIONS, read_settings, section
-from tests.unit.runtime.test_setting_rules import TABLES
+from tests.unit.runtime.test_config import TABLES
 
 from .conftest import Command
 from .given import Files

@@ -21,7 +21,7 @@ from reactorwatch.contract.codec import Encoded, decode
 from reactorwatch.contract.messages_pb2 import Health
 from reactorwatch.runtime.bus_zenoh import ZenohBus, router
 from reactorwatch.runtime.config import BusConfig
-from reactorwatch.runtime.loopback import LOOPBACK, free_endpoint
+from reactorwatch.runtime.http_pages import LOOPBACK, free_endpoint
 from reactorwatch.runtime.start import GONE_WITHIN_S
 from tests.running import mount_small_disk
 

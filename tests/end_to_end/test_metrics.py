@@ -15,8 +15,7 @@ from reactorwatch.contract.messages_pb2 import Health
 from reactorwatch.runtime.bus_zenoh import connect
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.event_loop import StopSignal
-from reactorwatch.runtime.loopback import LOOPBACK
-from reactorwatch.runtime.metrics import PORT_OFFSET
+from reactorwatch.runtime.http_pages import LOOPBACK, PORT_OFFSET
 from tests.ports import three_free_ports
 
 from .conftest import PATIENCE_S, Start

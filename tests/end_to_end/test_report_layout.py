@@ -26,10 +26,12 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
         yield opened
 
 
-def show(page: Browser, case: str, folder: Path) -> None:
+def show(page: Browser, case: str, folder: Path, *, unfold: bool = True) -> None:
     path = folder / "report.html"
     path.write_text(as_page(CASES[case], cstr(), EFFECTS, "plant.csv", "extended.json"), encoding="utf-8")
     page.go_to(path.as_uri())
+    if unfold:
+        page.evaluate("document.querySelectorAll('details').forEach(item => { item.open = true }) || 0")
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -55,3 +57,26 @@ def test_what_is_worse_has_the_stronger_colour_on_either_ground(page: Browser, s
     ordered = sorted(opacity)
     assert all(first[1] <= second[1] + 1e-3 for first, second in pairwise(ordered))
     assert ordered[-1][1] > ordered[0][1] + 0.2
+
+
+A4_PX = 688
+"""Width of A4 without its margins of 14 mm, at 96 pixels an inch."""
+
+CLOSED = """[...document.querySelectorAll('details > :not(summary)')].filter(item => !item.checkVisibility({
+  contentVisibilityAuto: true, checkOpacity: true}) || item.getBoundingClientRect().height === 0).length"""
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_in_print_sections_are_open_in_colour_on_a_light_ground_and_no_equation_is_cut(
+    page: Browser, case: str, tmp_path: Path
+) -> None:
+    page.prefer("dark")
+    page.emulate_print(A4_PX)
+    show(page, case, tmp_path, unfold=False)
+    assert page.evaluate("document.querySelectorAll('details:not([open])').length") >= 4
+    assert page.evaluate(CLOSED) == 0
+    assert page.evaluate(SPILLED.format(selector=".equation, figure, .wide")) == 0
+    assert page.evaluate("document.documentElement.scrollWidth") <= A4_PX
+    body = "getComputedStyle(document.body)"
+    assert page.evaluate(f"{body}.backgroundColor") == "rgb(255, 255, 255)"
+    assert page.evaluate(f"{body}.printColorAdjust") == "exact"

@@ -15,8 +15,8 @@ from reactorwatch.contract.messages_pb2 import Health, Sample
 from reactorwatch.runtime.bus_zenoh import connect
 from reactorwatch.runtime.config import BusConfig, read_settings, section
 from reactorwatch.runtime.event_loop import StopSignal
-from reactorwatch.runtime.loopback import free_port
-from reactorwatch.runtime.security.provisioning import make_site
+from reactorwatch.runtime.http_pages import free_port
+from reactorwatch.runtime.provisioning import make_site
 from recorder.files.recording import Recording
 
 from .conftest import PATIENCE_S, Command, Start

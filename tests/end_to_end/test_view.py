@@ -15,7 +15,7 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
-from reactorwatch.runtime.loopback import free_port
+from reactorwatch.runtime.http_pages import free_port
 from recorder.panels.base import INPUT, MEASURED, PREDICTED, Colour
 
 from .browser import Browser, browser

@@ -114,7 +114,7 @@ def judge(hidden: Hidden, said: Diagnosis, seconds: float) -> Judged:
         said=named,
         profiles=tuple(item.profile for item in sorted(causes, key=lambda item: item.cause)),
         alternatives=tuple("+".join(item) for item in others),
-        location=said.location,
+        location=said.location or "",
         first=first,
         listed=first or (bool(hidden.causes) and hidden.causes in others),
         count=1 + len(said.alternatives),

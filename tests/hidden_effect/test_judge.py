@@ -1,9 +1,8 @@
 """A diagnosis is held against the truth as a person would, on diagnoses made up for it."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from reactorwatch.diagnosis.result import Alternative, Cause, Curves, Diagnosis, Estimate, Gain, HeldOut
 from reactorwatch.records.record import Record
@@ -31,19 +30,25 @@ def make_diagnosis(
 ) -> Diagnosis:
     """A diagnosis that names steps of 2.02 +- 0.02 at 4.5 +- 0.1 min."""
     parameters = {"size": Estimate(2.02, 0.02, "K"), "onset": Estimate(4.5, 0.1, "min")}
-    causes = tuple(Cause(name, "step", "", location, parameters) for name in names)
+
+    def cause(name: str, profile: str) -> Cause:
+        return Cause(cause=name, profile=profile, label="", location=location, parameters=parameters)
+
     curve = np.where(TIME >= 4.5, 2.02, 0.0)
     held_out = {"T": HeldOut(3.0, 0.33, 3.0, 0.33, 0.3, "K")}
     return Diagnosis(
+        file="made up",
+        zero=None,
         samples=11,
+        runs=1,
         span_min=10.0,
+        seconds=0.0,
         verdict=verdict,
-        causes=causes,
-        alternatives=tuple(
-            Alternative(tuple(Cause(part, "ramp", "", location, parameters) for part in item.split("+")), 3.0)
-            for item in others
-        ),
+        causes=tuple(cause(name, "step") for name in names),
+        alternatives=tuple(Alternative(tuple(cause(part, "ramp") for part in item.split("+")), 3.0) for item in others),
         location=location,
+        locations=(),
+        law=None,
         significant=True,
         practical=True,
         differences={},

@@ -9,7 +9,7 @@ import structlog
 
 from reactorwatch.runtime import bus_zenoh
 from reactorwatch.runtime.config import BusConfig
-from reactorwatch.runtime.loopback import free_endpoint
+from reactorwatch.runtime.http_pages import free_endpoint
 
 from .site import Site
 

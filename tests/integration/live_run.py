@@ -20,7 +20,7 @@ from reactorwatch.contract.codec import DecodeError, Encoded, decode, encode
 from reactorwatch.contract.messages_pb2 import Alarm, Estimate, Health, Incident, Sample
 from reactorwatch.records.record import MINUTE_NS
 from reactorwatch.runtime.config import BusConfig
-from reactorwatch.runtime.loopback import free_endpoint
+from reactorwatch.runtime.http_pages import free_endpoint
 from recorder.config import RecorderConfig
 from recorder.files.recording import Recording
 from recorder.tools.player import samples_of

@@ -12,8 +12,8 @@ from reactorwatch.contract.codec import Encoded
 from reactorwatch.runtime.bus_zenoh import ZenohBus, connect, router_from_file
 from reactorwatch.runtime.config import BusConfig, read_settings, section
 from reactorwatch.runtime.event_loop import StopSignal
-from reactorwatch.runtime.loopback import free_port
-from reactorwatch.runtime.security.provisioning import make_site
+from reactorwatch.runtime.http_pages import free_port
+from reactorwatch.runtime.provisioning import make_site
 
 PLANTS = ("cstr", "other")
 WITHIN_S = 60.0

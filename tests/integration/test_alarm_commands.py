@@ -17,7 +17,7 @@ from reactorwatch.contract.messages_pb2 import Alarm, AlarmKpis, AlarmState, Est
 from reactorwatch.records.record import to_time_ns
 from reactorwatch.runtime.bus_zenoh import ZenohBus, router
 from reactorwatch.runtime.config import BusConfig
-from reactorwatch.runtime.loopback import free_endpoint
+from reactorwatch.runtime.http_pages import free_endpoint
 from tests.running import Command
 from tests.unit.monitor_node.samples import leaking_run, samples
 

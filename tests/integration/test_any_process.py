@@ -15,8 +15,8 @@ from reactorwatch.cli.replay import run as run_verification
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import decode
 from reactorwatch.contract.messages_pb2 import Alarm, Estimate
-from reactorwatch.description.find import find_process
-from reactorwatch.runtime.loopback import free_endpoint
+from reactorwatch.description.read import find_process
+from reactorwatch.runtime.http_pages import free_endpoint
 from recorder.columns import read_segments
 from recorder.files.recording import Recording
 from recorder.panels import signals

@@ -5,7 +5,7 @@ import threading
 from reactorwatch.contract.codec import Encoded
 from reactorwatch.runtime.bus_zenoh import ZenohBus, router
 from reactorwatch.runtime.config import BusConfig
-from reactorwatch.runtime.loopback import free_endpoint
+from reactorwatch.runtime.http_pages import free_endpoint
 from tests.running import WITHIN_S
 
 KEY = "reactor/cstr/sample/T"

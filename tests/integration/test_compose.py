@@ -11,7 +11,7 @@ import yaml
 
 from reactorwatch.runtime.bus_zenoh import router
 from reactorwatch.runtime.config import BusConfig
-from reactorwatch.runtime.loopback import free_endpoint
+from reactorwatch.runtime.http_pages import free_endpoint
 
 from .compose import NODES, PLAIN, SECURE, run_nodes, services_of
 

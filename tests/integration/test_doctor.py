@@ -20,11 +20,11 @@ from reactorwatch.cli.doctor import NODES, Finding, run_checks
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication, encode
 from reactorwatch.contract.messages_pb2 import Health
+from reactorwatch.runtime.acl import access_control
 from reactorwatch.runtime.bus_zenoh import ZenohBus, connect_now, router, router_from_file
 from reactorwatch.runtime.config import BusConfig
-from reactorwatch.runtime.loopback import free_endpoint
-from reactorwatch.runtime.security.acl import access_control
-from reactorwatch.runtime.security.provisioning import make_site
+from reactorwatch.runtime.http_pages import free_endpoint
+from reactorwatch.runtime.provisioning import make_site
 
 from ..end_to_end.conftest import REACTORWATCH
 from .site import WITHIN_S, Site, make, settings

@@ -16,7 +16,7 @@ from urllib.request import urlopen
 import msgspec
 import pytest
 
-from monitor_node.fleet.config import FleetConfig
+from monitor_node.fleet import FleetConfig
 from reactorwatch.cli.processes import write_settings
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, decode, encode_message
@@ -25,8 +25,7 @@ from reactorwatch.runtime import bus_zenoh
 from reactorwatch.runtime.bus_zenoh import ZenohBus
 from reactorwatch.runtime.config import BusConfig, MetricsConfig
 from reactorwatch.runtime.event_loop import StopSignal
-from reactorwatch.runtime.loopback import LOOPBACK
-from reactorwatch.runtime.metrics import PORT_OFFSET
+from reactorwatch.runtime.http_pages import LOOPBACK, PORT_OFFSET
 from tests.ports import three_free_ports
 from tests.running import WITHIN_S
 from tests.unit.monitor_node.fleets import QUICK, alone, run_of

@@ -12,7 +12,7 @@ from benchmarks.harness.site import PATIENCE_S, Router, connect_client
 from reactorwatch.contract.codec import Encoded
 from reactorwatch.runtime.bus_zenoh import bus as bus_module
 from reactorwatch.runtime.config import BusConfig
-from reactorwatch.runtime.loopback import free_endpoint
+from reactorwatch.runtime.http_pages import free_endpoint
 
 KEYS = ("reactor/cstr/sample/C", "reactor/cstr/sample/T")
 SLOW = "reactor/cstr/sample/x/@adv/**"

@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING
 import pytest
 
 from reactorwatch.contract import keys
+from reactorwatch.runtime.acl import ROLES
 from reactorwatch.runtime.event_loop import StopSignal
-from reactorwatch.runtime.security.acl import ROLES
 from reactorwatch.runtime.start import claim_name
 
 if TYPE_CHECKING:

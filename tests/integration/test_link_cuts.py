@@ -24,13 +24,13 @@ from benchmarks.harness.site import (
     connect_client,
     recorder_process,
 )
-from benchmarks.link_cuts import Whose, cut, kill_router, read_content, stick
+from benchmarks.losses import Whose, cut, kill_router, read_content, stick
 from reactorwatch.cli.info import info_text
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, decode
 from reactorwatch.contract.messages_pb2 import Sample
 from reactorwatch.runtime.config import BusConfig
-from reactorwatch.runtime.loopback import free_endpoint
+from reactorwatch.runtime.http_pages import free_endpoint
 from recorder.files.recording import Recording
 from recorder.tools.inspect import inspect
 

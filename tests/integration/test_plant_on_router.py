@@ -17,7 +17,7 @@ from reactorwatch.contract.messages_pb2 import CommandReply, Fault, Health, Inje
 from reactorwatch.runtime.bus_zenoh import ZenohBus, connect, router
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.event_loop import StopSignal
-from reactorwatch.runtime.loopback import free_endpoint
+from reactorwatch.runtime.http_pages import free_endpoint
 
 WITHIN_S = 60.0
 

@@ -5,7 +5,8 @@ import pytest
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded
 from reactorwatch.runtime.bus_zenoh import connect_now
-from reactorwatch.runtime.bus_zenoh.bus import EVERY_ROW, MAX_CACHED_OF_OTHERS, MAX_INCIDENTS
+from reactorwatch.runtime.bus_zenoh.bus import MAX_INCIDENTS
+from reactorwatch.runtime.bus_zenoh.messages import EVERY_ROW, MAX_CACHED_OF_OTHERS
 from reactorwatch.runtime.config import BusConfig
 
 PUBLISHED = 1000
@@ -19,7 +20,7 @@ KINDS = (
 def remembered(request: pytest.FixtureRequest) -> dict[str, int]:
     """Messages that a publisher remembers of each kind, after it has published a thousand on a key of each."""
     from reactorwatch.runtime import bus_zenoh
-    from reactorwatch.runtime.loopback import free_endpoint
+    from reactorwatch.runtime.http_pages import free_endpoint
 
     config = BusConfig(endpoint=free_endpoint())
     buses = [bus_zenoh.router(config), connect_now(config), connect_now(config)]
@@ -43,7 +44,7 @@ def test_messages_that_do_not_come_with_every_row_are_kept_for_a_while_only(
 
 def test_the_incidents_of_years_are_not_kept_but_the_newest_are() -> None:
     from reactorwatch.runtime import bus_zenoh
-    from reactorwatch.runtime.loopback import free_endpoint
+    from reactorwatch.runtime.http_pages import free_endpoint
 
     config, published = BusConfig(endpoint=free_endpoint()), 2 * MAX_INCIDENTS
     buses = [bus_zenoh.router(config), connect_now(config), connect_now(config)]

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmarks.recorder_kills import kill_often
+from benchmarks.losses import kill_often
 
 RATE_PER_S = 1000
 """A machine that has much else to do cannot keep up with the five thousand of `make kills`."""

@@ -11,7 +11,7 @@ import pytest
 from reactorwatch.contract.codec import Encoded
 from reactorwatch.runtime.bus import Bus
 from reactorwatch.runtime.bus_zenoh import connect
-from reactorwatch.runtime.bus_zenoh.refusal_log import LOG_EVERY_NS, RefusalLog
+from reactorwatch.runtime.bus_zenoh.sessions import LOG_EVERY_NS, RefusalLog
 from reactorwatch.runtime.event_loop import StopSignal
 
 from .site import WITHIN_S, make, settings

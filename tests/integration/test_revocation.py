@@ -7,7 +7,7 @@ from pathlib import Path
 
 from reactorwatch.contract.codec import Encoded
 from reactorwatch.runtime.bus_zenoh import connect, router_from_file
-from reactorwatch.runtime.security.provisioning import make_site
+from reactorwatch.runtime.provisioning import make_site
 
 from .site import OneAttempt, Site, make, settings
 

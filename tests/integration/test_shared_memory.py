@@ -12,7 +12,7 @@ from reactorwatch.contract.codec import Encoded
 from reactorwatch.runtime import bus_zenoh
 from reactorwatch.runtime.bus_zenoh import ZenohBus, connect_now
 from reactorwatch.runtime.config import BusConfig
-from reactorwatch.runtime.loopback import free_endpoint
+from reactorwatch.runtime.http_pages import free_endpoint
 
 MAPS = Path("/proc/self/maps")
 PUBLISHERS, PAYLOAD_BYTES, WITHIN_S = 3, 100_000, 60.0

@@ -9,7 +9,7 @@ from reactorwatch.contract.codec import Encoded, Publication, encode
 from reactorwatch.contract.messages_pb2 import Alarm, AlarmState, CommandReply, Health
 from reactorwatch.runtime.bus_zenoh import connect_now, router
 from reactorwatch.runtime.config import BusConfig
-from reactorwatch.runtime.loopback import free_endpoint
+from reactorwatch.runtime.http_pages import free_endpoint
 
 from ..end_to_end.conftest import REACTORWATCH
 from .site import WITHIN_S, Site

@@ -17,8 +17,7 @@ from reactorwatch.runtime.reorder_buffer import Gap
 from reactorwatch.version import UNKNOWN, build_metadata, describe_build
 from recorder import RecordedMessage
 from recorder.files.copies import cut, recover, sample_window
-from recorder.files.metadata import GAP, gap_metadata
-from recorder.files.recording import Recording
+from recorder.files.recording import GAP, Recording, gap_metadata
 from recorder.files.writer import RecordingWriter
 
 from .watched_hour import ROWS, START_NS, record_hour

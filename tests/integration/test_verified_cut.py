@@ -22,7 +22,7 @@ from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.event_loop import EventLoop, StopSignal
-from reactorwatch.runtime.loopback import free_endpoint
+from reactorwatch.runtime.http_pages import free_endpoint
 from recorder.__main__ import record
 from recorder.config import RecorderConfig
 from tests.running import WITHIN_S, running

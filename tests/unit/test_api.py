@@ -63,22 +63,6 @@ def test_a_diagnosis_names_the_leak_and_its_extended_model_simulates_it(
     assert "coolant" in (tmp_path / "report.html").read_text(encoding="utf-8")
 
 
-def test_a_backtest_and_a_monitor_that_is_fed_row_by_row_raise_the_same_alarms(leaking: Record) -> None:
-    settings: dict[str, Any] = {"training_min": 20.0, "isolation": False, "diagnose_training": False}
-    result = rw.backtest(leaking, **settings)
-    assert result.alarms
-    assert result.alarms[0].raised_min >= LEAK_MIN
-    assert result.text in str(result)
-    monitor, changes = rw.Monitor(**settings), []
-    for row, minute in enumerate(leaking.time_min):
-        changes += monitor.update(float(minute), {name: float(values[row]) for name, values in leaking.columns.items()})
-        if row == leaking.rows // 2:
-            state, monitor = monitor.to_bytes(), rw.Monitor(**settings)
-            monitor.from_bytes(state)
-    raised = [(item.alarm, item.time_min) for item in changes if item.event == "raised"]
-    assert raised == [(item.alarm, item.raised_min) for item in result.alarms]
-
-
 def test_a_monitor_that_is_restored_in_an_incident_gives_the_same_changes() -> None:
     """Alarms of a small leak join its incident between the looks for its cause."""
     scenario, fault = {"kind": "random-steps"}, f"coolant_flow:step:-0.01@{LEAK_MIN:g}min"
@@ -101,12 +85,6 @@ def test_a_monitor_that_is_restored_in_an_incident_gives_the_same_changes() -> N
 
 def test_the_model_that_a_diagnosis_extended_judges_without_alarm(leaking: Record, found: DiagnosisResult) -> None:
     assert not rw.backtest(leaking, found.extended, training_min=20.0, diagnose_training=False).alarms
-
-
-def test_identification_gives_its_fit_under_both_names(leaking: Record) -> None:
-    found = rw.identify(leaking, output="T", model="arx", order=2)
-    assert found.fit is found.fit_percent
-    assert found.fit.one_step > 80.0
 
 
 @pytest.mark.parametrize(

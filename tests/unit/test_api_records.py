@@ -8,7 +8,7 @@ import pyarrow as pa
 import pytest
 
 import reactorwatch as rw
-from reactorwatch.description.find import ProcessChoice
+from reactorwatch.description.read import ProcessChoice
 from reactorwatch.records.record import Record as MeasuredRecord
 from reactorwatch.records.write import write_table
 from recorder.tools.convert import import_csv
@@ -68,25 +68,11 @@ def test_a_record_is_taken_with_its_process_by_all_functions(from_arrays: rw.Rec
     assert found.fit.free_run > 75.0
     result = rw.backtest(from_arrays)
     assert result.reference in ("black-box", "arx")
-    assert (result.signals["inputs"], result.signals["outputs"]) == (["u"], ["y"])
+    assert (result.signals.inputs, result.signals.outputs) == (["u"], ["y"])
     assert result.trained_until_min == pytest.approx(100 * 2 / 60)
     for function in (rw.simulate, rw.diagnose):
         with pytest.raises(rw.InputError, match="process 'rig': must have equations for this, got none"):
             function(from_arrays)
-
-
-def test_a_monitor_that_is_fed_its_rows_raises_the_alarms_of_the_back_test(from_arrays: rw.Record) -> None:
-    shifted = {name: values.copy() for name, values in from_arrays.signals.items()}
-    shifted["y"][200:] += 1.0
-    record = rw.Record(time_min=from_arrays.time_min, signals=shifted, process=RIG)
-    result, changes = rw.backtest(record, training_rows=100, reference="black-box"), []
-    monitor = rw.Monitor(RIG, training_rows=100, reference="black-box")
-    for row, minute in enumerate(record.time_min.tolist()):
-        values = {name: float(values[row]) for name, values in record.signals.items()}
-        changes += monitor.update(minute, values)
-    raised = [(item.alarm, item.time_min) for item in changes if item.event == "raised"]
-    assert raised
-    assert raised == [(item.alarm, item.raised_min) for item in result.alarms]
 
 
 def test_a_recording_describes_the_process_of_its_record(from_arrays: rw.Record, tmp_path: Path) -> None:

@@ -18,8 +18,9 @@ from monitor_node.watched_process import load_process
 from reactorwatch.api.monitor import monitor_settings
 from reactorwatch.cli.main import app
 from reactorwatch.contract.codec import encode
-from reactorwatch.description.find import ProcessChoice
+from reactorwatch.description.read import ProcessChoice
 from reactorwatch.records.write import write_table
+from reactorwatch.results.backtest import Backtest
 from recorder.config import ReplayConfig
 from recorder.tools.convert import export_csv, import_csv
 from recorder.tools.replay import open_tape
@@ -57,7 +58,7 @@ class Plant(NamedTuple):
         import_csv(self.table, self.folder / "rows.mcap", choice=ProcessChoice(str(self.process)))
         return self.folder / "rows.mcap"
 
-    def watch(self, messages: Any) -> backtest.Backtest:
+    def watch(self, messages: Any) -> Backtest:
         """A monitor over samples from the bus."""
         config, model = load_process(monitor_settings({"process": str(self.process), "plant": "rig", **self.settings}))
         return backtest.run(map(encode, messages), config, 0, model)
@@ -124,7 +125,7 @@ def of_record(plant: Plant, record: rw.Record) -> Any:
 
 def of_messages(plant: Plant, messages: Any) -> Any:
     found = plant.watch(messages)
-    return found.rows, [(item.alarm, item.raised_ns / 60e9) for item, _ in found.raised_alarms]
+    return found.samples, [(item.alarm, item.raised_min) for item in found.alarms]
 
 
 def two_files(plant: Plant) -> Any:

@@ -14,7 +14,7 @@ import pytest
 import monitor_node.checks
 import reactorwatch.spc.charts
 import recorder.panels
-from monitor_node.checks.stage import CHECKS
+from monitor_node.checks.signal_checks import CHECKS
 from monitor_node.config import CHART_SIGNALS, MonitorConfig
 from monitor_node.watch import row_frame, row_step
 from reactorwatch.process import EFFECTS_OF
@@ -38,7 +38,7 @@ def test_every_file_of_the_folder_is_listed(family: str) -> None:
         "__init__",
         "base",
         "catalogue",
-        "stage",
+        "value_chart",
     }
     assert {name.rpartition(".")[2] for name in listed} == files
 
@@ -92,10 +92,10 @@ def sources(tmp_path_factory: pytest.TempPathFactory) -> Path:
         folder,
         f"{checks}/jump.py",
         example("Add a signal check"),
-        f"{checks}/stage.py",
+        f"{checks}/signal_checks.py",
         "JumpCheck",
         "JumpCheck",
-        ")",
+        ", RangeCheck)",
     )
     effect = example("Add an effect").partition("\n\n\nfrom ")[0] + "\n"
     add(

@@ -17,16 +17,14 @@ from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
 
 from reactorwatch.cli.main import LIMITS_FILE, main
-from reactorwatch.description.find import find_process
 from reactorwatch.description.process import Process, Signal
+from reactorwatch.description.read import find_process, read_extended_model
 from reactorwatch.errors import InputError
 from reactorwatch.limits import Limits, limits, parse_json, parse_toml, set_limits
 from reactorwatch.process.extended_model import parse_extended_model
 from reactorwatch.records.file_format import FileFormat
 from reactorwatch.runtime.config import read_settings
-from reactorwatch.runtime.executors import ProcessExecutor
-from reactorwatch.runtime.jobs import SerialExecutor
-from reactorwatch.runtime.model_file import read_extended_model
+from reactorwatch.runtime.jobs import ProcessExecutor, SerialExecutor
 from tests.unit.runtime.work import limits_in_force
 
 ROOT = Path(__file__).parents[2]

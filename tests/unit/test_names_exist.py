@@ -52,7 +52,7 @@ def sources() -> list[Path]:
 
 @cache
 def files() -> frozenset[str]:
-    """Paths, and their ends: `monitor_node/fleet/monitor.py`, `fleet/monitor.py` and `monitor.py`."""
+    """Paths, and their ends: `monitor_node/fleet.py`, `monitor_node/fleet.py` and `monitor.py`."""
     paths = [path for folder in FOLDERS for path in (ROOT / folder).rglob("*")]
     parts = [path.relative_to(ROOT).parts for path in (*ROOT.iterdir(), *paths)]
     return frozenset("/".join(part[start:]) for part in parts for start in range(len(part)))
@@ -98,9 +98,9 @@ def test_names_in_docstrings_comments_and_docs_exist() -> None:
     ("text", "missing"),
     [
         ("what is done is in `output_watch.py`", ["output_watch.py"]),
-        ("see fleet/monitor.py", []),
+        ("see watch/pipeline.py", []),
         ("see charts/rows.py", ["charts/rows.py"]),
-        ("[x](../monitor_node/ingest/alignment.py)", []),
+        ("[x](../monitor_node/ingest/rows.py)", []),
     ],
 )
 def test_a_file_that_does_not_exist_is_found(text: str, missing: list[str]) -> None:

@@ -1,7 +1,9 @@
 """Results in a notebook: each shows itself as HTML, as a figure, as a frame and as a page."""
 
+import copy
 import csv
 import io
+import json
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Iterator
 from datetime import UTC, datetime, timedelta
@@ -50,6 +52,19 @@ def test_a_result_is_well_formed_html_without_markup_from_elsewhere(results: dic
     assert "<b>" in shown
 
 
+@pytest.mark.parametrize("name", ["backtest", "diagnosis", "identification"])
+def test_a_result_has_the_fields_of_its_json_as_attributes_and_survives_a_copy(
+    results: dict[str, Any], name: str
+) -> None:
+    result = results[name]
+    stated = json.loads(json.dumps(result.to_dict(), allow_nan=False))
+    assert len(stated) > 10
+    assert stated.keys() - {"differences"} <= set(dir(result))
+    for key, value in stated.items():
+        assert value is None or getattr(result, key) is not None
+    assert copy.copy(result).to_dict() == result.to_dict()
+
+
 @pytest.mark.parametrize("name", RESULTS)
 def test_a_result_is_a_figure_with_a_panel_for_each_signal(results: dict[str, Any], name: str) -> None:
     pytest.importorskip("matplotlib")
@@ -61,13 +76,13 @@ def test_a_result_is_a_figure_with_a_panel_for_each_signal(results: dict[str, An
 
 @pytest.mark.parametrize("name", RESULTS)
 def test_a_result_is_a_page_that_stands_alone(results: dict[str, Any], name: str, tmp_path: Path) -> None:
-    pytest.importorskip("matplotlib")
     results[name].to_html(tmp_path / "page.html")
     page = (tmp_path / "page.html").read_text(encoding="utf-8")
     assert page.startswith("<!doctype html>")
     assert "leak <1>" not in page
     assert f"reactorwatch {rw.__version__}" in page
     assert 'src="http' not in page
+    assert page.count("<svg viewBox") >= PANELS[name]
 
 
 def test_a_backtest_marks_its_training_and_its_alarms_in_its_figure(results: dict[str, Any]) -> None:

@@ -19,14 +19,14 @@ from reactorwatch.cli.main import main
 from reactorwatch.cli.status import StatusBoard, _text
 from reactorwatch.contract.codec import Encoded, Publication, encode
 from reactorwatch.contract.messages_pb2 import ALARM_STATE_UNACKNOWLEDGED, QUALITY_GOOD, Alarm, Sample
-from reactorwatch.runtime import logs
+from reactorwatch.runtime.node_main import configure_log
 from reactorwatch.terminal import printable, printable_lines
 from recorder import RecordedMessage
 from recorder.files.writer import RecordingWriter
 
 ROOT = Path(__file__).parents[2]
 HOSTILE = "\x1b[2J\x1b]0;title\x07 a\r\nb\tc\x7f\x9b31m\u202eevil\u2066\u200b\u2028\u2029\ufeff\U000e0041"
-BORDER = {"crash.py", "display.py", "replay.py"}
+BORDER = {"node_main.py", "display.py", "replay.py"}
 
 
 def acted_on(text: str) -> list[str]:
@@ -131,7 +131,7 @@ def test_alarms_and_status_from_the_bus_are_shown_and_not_sent(capsys: pytest.Ca
 
 
 def test_logs_for_people_are_lines_of_text(capsys: pytest.CaptureFixture[str]) -> None:
-    logs.configure()
+    configure_log()
     structlog.get_logger().warning(HOSTILE, key=HOSTILE, path=Path(HOSTILE), **{HOSTILE: 1})
     shown = capsys.readouterr().err
     assert acted_on(shown) == []

@@ -17,7 +17,7 @@ from math import log
 import numpy as np
 
 from reactorwatch.arrays import Array
-from reactorwatch.diagnosis.experiment.input_sequence import (
+from reactorwatch.diagnosis.experiment.inputs import (
     QUIET_ROWS,
     InputRange,
     InputSequence,

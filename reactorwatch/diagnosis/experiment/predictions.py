@@ -26,12 +26,11 @@ import numpy as np
 from scipy import special
 
 from reactorwatch.arrays import Array
-from reactorwatch.diagnosis.experiment.constraints import Limits, keeps_limits, limits_of
-from reactorwatch.diagnosis.experiment.input_sequence import InputRange
+from reactorwatch.diagnosis.experiment.inputs import InputRange, Limits, keeps_limits, limits_of
 from reactorwatch.diagnosis.fitting.colored_noise import Noise
-from reactorwatch.diagnosis.fitting.grid_search import fit_hypothesis
 from reactorwatch.diagnosis.fitting.hypothesis import Fit, Hypothesis
 from reactorwatch.diagnosis.fitting.profiles import Constant, FittedProfile, LateSine, Sine
+from reactorwatch.diagnosis.fitting.refinement import fit_hypothesis
 from reactorwatch.diagnosis.result import LISTED
 from reactorwatch.diagnosis.run import Run
 from reactorwatch.diagnosis.search.search import FittedHypothesis

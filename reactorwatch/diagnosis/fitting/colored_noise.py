@@ -9,6 +9,12 @@ estimated here with the other noise levels, by maximum likelihood (`estimate_noi
 More states make a filter slower, so coloured noise is modelled only where the record calls for it. Model error and
 process noise have almost no power at high frequencies; white noise has the same power at all of them. So the power of
 the simulation's residual in the band `LOW` is compared with that in the band `HIGH`.
+
+Sensor noise, estimated from the highest frequencies of a simulation's residual. A filter takes for sensor noise
+whatever its model cannot follow, and with it model error that acts at the sensor. To assess the model error, the noise
+has to be estimated independently: at high frequencies plant and model error have almost no power, and the spectrum of
+noise has a known shape, white or white plus a first-order autoregression. Its two levels are fitted by Whittle's
+likelihood (Whittle 1953, Arkiv for Matematik 2).
 """
 
 from collections.abc import Sequence
@@ -22,7 +28,7 @@ import numpy as np
 from reactorwatch.arrays import Array
 from reactorwatch.kalman.batch import FilterRecord
 from reactorwatch.kalman.ekf_step import NoiseLevels
-from reactorwatch.kalman.noise_estimation import fit_noise
+from reactorwatch.kalman.noise_estimation import fit_noise, resolution_sd
 from reactorwatch.process.model import ProcessModel, parameter, variable
 
 LOW, HIGH = (0.375, 0.625), (0.75, 1.0)
@@ -189,3 +195,49 @@ def _power_ratio(residual: Array) -> float:
     share, power = spectrum
     low, high = (float(np.mean(power[(share >= begin) & (share < end)])) for begin, end in (LOW, HIGH))
     return low / high if high > 0.0 else 1.0
+
+
+ROUNDS = 100
+"""Number of multiplicative steps, after which the levels change by less than a thousandth."""
+
+_LEAST_SHARE = 1e-6
+
+
+def estimate_sensor_noise(
+    noise: Noise, outputs: Sequence[str], residual: Array, measured: Array, period_min: float
+) -> Array:
+    """Standard deviation of each sensor's noise, shape (n_y,), at most the filter's estimate.
+
+    Args:
+        noise: the filter's noise levels, with the time constants of coloured noise.
+        outputs: names of the outputs.
+        residual: measured minus simulated, shape (rows, n_y); NaN where either is missing.
+        measured: measurements, shape (rows, n_y); quantisation is noise, too.
+        period_min: median sampling period.
+    """
+    time_min = {item.output: item.time_min for item in noise.colored}
+    sd = noise.sensor_sd(outputs)
+    for index, name in enumerate(outputs):
+        decay = float(np.exp(-period_min / time_min[name])) if name in time_min else 0.0
+        level = _high_frequency_sd(residual[:, index], decay)
+        sd[index] = min(sd[index], max(level, resolution_sd(measured[:, index])))
+    return sd
+
+
+def _high_frequency_sd(residual: Array, decay: float) -> float:
+    """Standard deviation of white noise plus an AR(1) with this coefficient; infinite if the record is too short."""
+    spectrum = power_spectrum(residual)
+    if spectrum is None:
+        return float("inf")
+    share, power = (column[spectrum[0] >= LOW[0]] for column in spectrum)
+    if decay == 0.0:
+        return float(np.sqrt(np.mean(power)))
+    shapes = np.stack(
+        [np.ones(share.size), (1.0 - decay**2) / (1.0 - 2.0 * decay * np.cos(np.pi * share) + decay**2)], axis=1
+    )
+    levels = np.full(2, float(np.mean(power)))
+    for _ in range(ROUNDS):  # multiplicative steps keep both levels positive
+        expected = shapes @ levels
+        levels = levels * np.sqrt((shapes.T @ (power / expected**2)) / (shapes.T @ (1.0 / expected)))
+        levels = np.maximum(levels, _LEAST_SHARE * levels.max())
+    return float(np.sqrt(levels.sum()))

@@ -12,18 +12,22 @@ from numpy.typing import NDArray
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.compiled_function import LANES
 from reactorwatch.codegen.numba_kernel import jit
-from reactorwatch.diagnosis.fitting.augmented_model import AugmentedModel, augment_model
+from reactorwatch.diagnosis.fitting.augmented_model import (
+    AugmentedModel,
+    ShiftedRun,
+    augment_model,
+    restore_rows,
+    shift_measurements,
+)
 from reactorwatch.diagnosis.fitting.colored_noise import Noise, add_colored_noise, estimate_noise
-from reactorwatch.diagnosis.fitting.measurement_delay import ShiftedRun, restore_rows, shift_measurements
 from reactorwatch.diagnosis.fitting.profiles import Signal
 from reactorwatch.diagnosis.run import Run, input_uncertainty_of
 from reactorwatch.kalman.batch import (
-    STEPS_PER_EVALUATION,
-    STEPS_PER_LINEARISATION,
     FilterRecord,
     FilterResult,
     ResampledRecord,
     StepBudget,
+    StepCost,
     count_pieces,
     insert_rows,
     run_together,
@@ -78,7 +82,7 @@ class FaultFilter:
     """EKF of a model in which the magnitudes of some effects are inputs.
 
     A measurement delay is not part of the filter's model: the delayed values are shifted in time (see
-    `measurement_delay`).
+    `augmented_model`).
 
     Args:
         model: process model of the plant.
@@ -178,7 +182,7 @@ class FaultFilter:
         return self._augmented.interval_inputs[index], self._augmented.sample_inputs[index]
 
     def shifts_time(self, index: int) -> bool:
-        """Return true if the effect at this index shifts the timing, see `input_timing`."""
+        """Return true if the effect at this index shifts the timing, see `augmented_model`."""
         late = self.delay_index
         return index != late and self._augmented.shifts_time[index - (late is not None and late < index)]
 
@@ -207,7 +211,7 @@ class FaultFilter:
             shared: for each set, a run with the same first rows or None; None: no such runs.
         """
         laid = [self._lay_out_rows(run, signals) for signals in several]
-        self.spend(sum(STEPS_PER_EVALUATION + rows.time_min.size // 10 for rows, _ in laid))
+        self.spend(sum(StepCost.EVALUATION + rows.time_min.size // 10 for rows, _ in laid))
         # With a delayed output the filter's rows depend on the delay, so no prefix is shared.
         prefixes = [None] * len(laid) if shared is None or self.delay_index is not None else shared
         innovations = self._filter_rows([rows for rows, _ in laid], prefixes)
@@ -289,7 +293,7 @@ class FaultFilter:
 
     def error_dynamics(self, run: Run, signals: Sequence[Signal], innovations: FilterResult) -> ErrorDynamics:
         """Error equations about a filter run, from the second row on, the first one that is predicted."""
-        self.spend(STEPS_PER_LINEARISATION + int(1.5 * np.sum(count_pieces(run.time_min))))
+        self.spend(StepCost.LINEARISATION + int(1.5 * np.sum(count_pieces(run.time_min))))
         return error_dynamics_between(self._errors, run, self.inputs(run, signals), innovations, self.used_values(run))
 
     def used_values(self, run: Run) -> NDArray[np.bool_]:

@@ -5,23 +5,30 @@ Huber (1964, Robust estimation of a location parameter, Annals of Mathematical S
 `HUBER` standard deviations. With process noise the filter follows the measurements, without any it is a simulation; so
 a plant that starts on another branch, or is extinguished, does not mislead the fit. The loss is minimised by
 Gauss-Newton steps with Levenberg-Marquardt damping. Derivatives come from the filter's error equations (`signatures`).
-Magnitudes of discontinuous effects have no derivatives and are scanned (`grid_search`).
+Magnitudes of discontinuous effects have no derivatives and are scanned (`refinement`).
+
+Prior probabilities of hypotheses, as costs in BIC (docs/decisions/0014-two-causes.md). Of n possible causes each is
+there from the beginning with the probability 1/n, so that one is expected, and a cause that nothing in the catalogue
+describes is as likely in each location as one of the catalogue. So two independent causes that are both there from the
+beginning have 1/n of the prior odds of one, known or not: a cost of 2 log n. Causes that set in later are not charged
+for it: one may follow from the other, and a time of its own is evidence of each.
 """
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from math import log
 
 import numpy as np
 
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.compiled_function import LANES
 from reactorwatch.diagnosis.fitting import signatures
-from reactorwatch.diagnosis.fitting.bounded_least_squares import inverse
 from reactorwatch.diagnosis.fitting.fault_filter import FaultFilter, SharedPrefix, huber_clip, huber_weights
 from reactorwatch.diagnosis.fitting.profiles import FittedProfile, Signal
+from reactorwatch.diagnosis.fitting.signatures import inverse
 from reactorwatch.diagnosis.parameter_priors import last_finite_row, offsets
 from reactorwatch.diagnosis.run import Run
-from reactorwatch.kalman.batch import STEPS_PER_COVARIANCE, FilterResult
+from reactorwatch.kalman.batch import FilterResult, StepCost
 from reactorwatch.kalman.error_dynamics import ErrorDynamics
 
 CONVERGED, WELL_CONVERGED = 0.05, 0.005
@@ -223,7 +230,7 @@ class Hypothesis:
 
     def _covariance(self, g: Array) -> Array:
         """Covariance of the parameters from their Jacobian."""
-        self.filter.spend(STEPS_PER_COVARIANCE)
+        self.filter.spend(StepCost.COVARIANCE)
         information = g.T @ g + self._prior_information()
         return inverse(information)
 
@@ -403,3 +410,20 @@ def _count_equal_rows(one: Sequence[Signal], other: Sequence[Signal]) -> int:
             return 0
         differs |= (mine.interval_mean != theirs.interval_mean) | (mine.sample_value != theirs.sample_value)
     return int(np.argmax(differs)) if differs.any() else rows
+
+
+SOURCE_COST = 6.0
+"""Cost in BIC of an unmodelled source, odds of twenty to one: a cause with a name has to be worse by more, before it
+counts as unknown."""
+
+FROM_BEGINNING = frozenset(("constant", "sine", "free"))
+"""Profiles without an onset."""
+
+
+def prior_cost(hypothesis: Hypothesis, n_causes: int) -> float:
+    """Minus twice the logarithm of the prior odds of a hypothesis against a single named cause, of so many possible."""
+    effects, profiles = hypothesis.filter.effects, hypothesis.profiles
+    result = SOURCE_COST * sum(effect.is_source for effect in effects)
+    if len(effects) > 1 and all(profile.name in FROM_BEGINNING for profile in profiles):
+        result += 2.0 * log(n_causes)
+    return result

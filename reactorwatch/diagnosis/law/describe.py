@@ -9,21 +9,19 @@ from numpy.typing import NDArray
 
 from reactorwatch.arrays import Array
 from reactorwatch.diagnosis.fitting import signatures
-from reactorwatch.diagnosis.fitting.bounded_least_squares import inverse
 from reactorwatch.diagnosis.fitting.fault_filter import FaultFilter
 from reactorwatch.diagnosis.fitting.hypothesis import Fit, Hypothesis
 from reactorwatch.diagnosis.fitting.profiles import Constant
+from reactorwatch.diagnosis.fitting.signatures import inverse
 from reactorwatch.diagnosis.law.fit import ShapeFit
-from reactorwatch.diagnosis.law.path import variables_along
-from reactorwatch.diagnosis.law.shapes import coefficient_effect
+from reactorwatch.diagnosis.law.shapes import coefficient_effect, variables_along
 from reactorwatch.diagnosis.law.unknown import FittedLaw, Unknown
 from reactorwatch.diagnosis.parameter_priors import add_priors
-from reactorwatch.diagnosis.result import LISTED, Estimate, HeldOut, Law, LawCurve, RivalLaw
+from reactorwatch.diagnosis.result import LISTED, Correlation, Estimate, HeldOut, Law, LawCurve, RivalLaw
 from reactorwatch.diagnosis.run import Run
 from reactorwatch.diagnosis.search.search import FittedHypothesis
-from reactorwatch.process.law import ExtendedLaw, find_form
+from reactorwatch.process.law import CAPACITY, FACTOR, INPUT, SOURCE, ExtendedLaw, find_form, unit_of, unit_of_variable
 from reactorwatch.process.model import Place, ProcessModel
-from reactorwatch.process.places import CAPACITY, FACTOR, INPUT, SOURCE, unit_of, unit_of_variable
 
 BINS = 30
 """Number of points of a curve, each the mean of as many rows."""
@@ -151,7 +149,7 @@ def _means(values: Array, groups: Sequence[NDArray[np.intp]]) -> Array:
     return np.array([float(np.mean(values[rows])) for rows in groups])
 
 
-def _correlations(model: ProcessModel, run: Run, best: FittedLaw) -> dict[str, tuple[str, float]]:
+def _correlations(model: ProcessModel, run: Run, best: FittedLaw) -> dict[str, Correlation]:
     """The model's parameter that each parameter of the law is correlated with most, if it were uncertain."""
     names = [item.name for item in model.parameters if item.value != 0.0]
     n_law = best.fit.coefficients.size
@@ -167,5 +165,5 @@ def _correlations(model: ProcessModel, run: Run, best: FittedLaw) -> dict[str, t
             value = float(part[index, -1]) / scale if scale > 0.0 else 0.0
             largest = max(largest, (parameter, value), key=lambda item: abs(item[1]))
         if abs(largest[1]) >= LEAST_CORRELATION:
-            result[name] = largest
+            result[name] = Correlation(*largest)
     return result

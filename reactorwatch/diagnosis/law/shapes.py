@@ -3,24 +3,141 @@
 The functions are low powers, products and hinges of the variables, scaled by the record's own means and spreads, so
 that coefficients of all places are of order one. The scales are parameters of the model, so that the machine code is
 the same for every record. A sensor may also remember: its functions include the direction in which the output moves,
-unless a controller moves it in answer to the measurement (`feedback`).
+unless a controller moves it in answer to the measurement (`find_answers`).
+
+Inputs that a controller moves in answer to a measurement of the same row. Such an input has the measurement's noise in
+it. A correction of the sensor that depends on the input would predict that noise, which no cause can, and would be
+better than every explanation by thousands in BIC. In open loop what an input does in a row is independent of what is
+measured in that row, given the rows before (the instantaneous causality of Granger 1969, Investigating causal relations
+by econometric models and cross-spectral methods, Econometrica 37).
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from itertools import combinations
+from math import sqrt
 
 import casadi as ca
 import numpy as np
 
 from reactorwatch.arrays import Array
-from reactorwatch.diagnosis.law.feedback import Answers
-from reactorwatch.diagnosis.law.path import Scale, evaluate_along
+from reactorwatch.diagnosis.run import Run
 from reactorwatch.process.effect import Effect, ParameterShift
-from reactorwatch.process.law import add_lag_states
+from reactorwatch.process.law import CAPACITY, FACTOR, SENSOR, add_lag_states, correct, find_place, variable_expression
 from reactorwatch.process.model import MODEL_CACHE_SIZE, Parameter, Place, ProcessModel
-from reactorwatch.process.places import CAPACITY, FACTOR, SENSOR, correct, find_place, variable_expression
+
+
+@dataclass(frozen=True)
+class Scale:
+    """Mean and spread of a variable along the record."""
+
+    mean: float
+    spread: float
+
+
+def variables_along(model: ProcessModel, run: Run, x: Array, place: Place, lag_min: float = 0.0) -> dict[str, Array]:
+    """Variables of a place along a path, by name, each of shape (rows,).
+
+    Args:
+        model: process model of the plant.
+        run: the record.
+        x: states along the path; further states may follow those of the model.
+        place: the place.
+        lag_min: time constant with which they lag behind; 0: none.
+    """
+    expressions = [variable_expression(model, name) for name in place.variables]
+    values = evaluate_along(model, expressions, x, run.inputs, run.time_min)
+    if lag_min:
+        keep = np.exp(-np.diff(run.time_min) / lag_min)
+        for column in values:
+            for row in range(1, column.size):
+                column[row] += keep[row - 1] * (column[row - 1] - column[row])
+    return dict(zip(place.variables, values, strict=True))
+
+
+def scales_along(model: ProcessModel, run: Run, x: Array, places: Sequence[Place]) -> dict[str, Scale]:
+    """Scales of the variables of all places, of the outputs and of their rates, `d(name)`."""
+    names = sorted({name for place in places for name in place.variables})
+    expressions = [variable_expression(model, name) for name in names]
+    outputs = [item.expression for item in model.outputs]
+    rates = [ca.mtimes(ca.jacobian(item, model.arguments()[0]), ca.vertcat(*model.rhs)) for item in outputs]
+    names += [*model.output_names, *(f"d({name})" for name in model.output_names)]
+    values = evaluate_along(model, [*expressions, *outputs, *rates], x, run.inputs, run.time_min)
+    return {
+        name: Scale(float(np.mean(item)), float(np.std(item)) or 1.0) for name, item in zip(names, values, strict=True)
+    }
+
+
+def evaluate_along(
+    model: ProcessModel,
+    expressions: Sequence[ca.SX],
+    x: Array,
+    inputs: Array,
+    time_min: Array,
+    changes: Mapping[str, float] | None = None,
+) -> Array:
+    """Values of expressions along a path, shape (expressions, rows); gaps of the path are bridged by straight lines.
+
+    Args:
+        model: process model of the expressions.
+        expressions: scalars.
+        x: states along the path; further states may follow those of the model.
+        inputs: shape (rows, n_u).
+        time_min: shape (rows,).
+        changes: parameters that differ from the model's values.
+    """
+    symbols = [*model.arguments(), model.clock.now, model.clock.middle]
+    function = ca.Function("along", symbols, [ca.densify(ca.vertcat(*expressions))])
+    own, time = _bridge_gaps(x[:, : len(model.states)]).T, time_min[None]
+    return np.array(function(own, np.nan_to_num(inputs.T), model.values(changes), time, time))
+
+
+def _bridge_gaps(x: Array) -> Array:
+    """Interpolate rows of a path in which no state is known."""
+    rows, known = np.arange(len(x)), np.flatnonzero(np.all(np.isfinite(x), axis=1))
+    return x if known.size == rows.size else np.column_stack([np.interp(rows, known, item[known]) for item in x.T])
+
+
+ANSWERS = 6.0
+"""Standard deviations by chance beyond which a correlation is an answer."""
+
+LAGS = 2
+"""Rows before that are given."""
+
+Answers = frozenset[tuple[str, str]]
+"""Pairs of an output and an input that answers to its measurement."""
+
+
+def find_answers(model: ProcessModel, run: Run) -> Answers:
+    """Find the inputs that answer to a measurement in the same row.
+
+    Args:
+        model: process model of the plant.
+        run: the record.
+    """
+    rows = np.column_stack([run.inputs, run.measured])
+    now, past = rows[LAGS:], np.hstack([rows[LAGS - lag : len(rows) - lag] for lag in range(1, LAGS + 1)])
+    known = np.all(np.isfinite(now), axis=1) & np.all(np.isfinite(past), axis=1)
+    past = np.column_stack([np.ones(np.count_nonzero(known)), past[known]])
+    if len(past) <= 2 * past.shape[1]:
+        return frozenset()
+    scale = np.maximum(np.abs(past).max(axis=0), 1e-300)
+    new = now[known] - past @ (np.linalg.lstsq(past / scale, now[known], rcond=None)[0] / scale[:, None])
+    count = len(model.inputs)
+    return frozenset(
+        (output, name)
+        for output, measured in zip(model.output_names, new[:, count:].T, strict=True)
+        for name, moved in zip(model.input_names, new[:, :count].T, strict=True)
+        if _correlation_in_sd(measured, moved) > ANSWERS
+    )
+
+
+def _correlation_in_sd(one: Array, other: Array) -> float:
+    """Size of a correlation in standard deviations by chance; 0 where one of the two does not vary."""
+    norm = float(np.linalg.norm(one) * np.linalg.norm(other))
+    return abs(float(one @ other)) / norm * sqrt(one.size) if norm > 0.0 else 0.0
+
 
 HINGES = (-0.7, 0.0, 0.7)
 """Positions of hinges, in spreads from the mean."""

@@ -6,6 +6,7 @@ the difference is further down. Elsewhere the whole new part is marked. So in K3
 marked, and in f - m (T - 298), put for f, the term after f.
 """
 
+import xml.etree.ElementTree as ElementTree
 from html import escape
 
 import casadi as ca
@@ -79,6 +80,22 @@ def name(symbol: str) -> str:
     return (
         f"<msub><mi>{first}</mi><{'mn' if rest.isdigit() else 'mi'}>{rest}</{'mn' if rest.isdigit() else 'mi'}></msub>"
     )
+
+
+def wrappable(text: str) -> list[str]:
+    """Split a sum between its terms, so that a page can wrap it; browsers do not break an expression by themselves.
+
+    >>> wrappable("<mi>a</mi><mo>−</mo><mi>b</mi>")
+    ['<mi>a</mi>', '<mo form="infix">−</mo><mi>b</mi>']
+    """
+    parts: list[list[ElementTree.Element]] = [[]]
+    for element in ElementTree.fromstring(f"<math>{text}</math>"):  # noqa: S314 (as above)
+        first = next((item for item in element.iter() if item.tag != "mrow"), element)
+        if first.tag == "mo" and first.text in ("+", "−") and parts[-1]:
+            first.set("form", "infix")  # at the start of its row it would be drawn as a sign, without a space
+            parts.append([])
+        parts[-1].append(element)
+    return ["".join(ElementTree.tostring(element, "unicode") for element in part) for part in parts]
 
 
 def mark_added(text: str) -> str:

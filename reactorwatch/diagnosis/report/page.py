@@ -1,5 +1,6 @@
 """A diagnosis as one self-contained page without scripts, readable in light and dark mode."""
 
+import re
 from collections.abc import Mapping, Sequence
 from math import isfinite
 from pathlib import PurePath
@@ -7,10 +8,17 @@ from shlex import quote
 
 import jinja2
 
+from reactorwatch import html
 from reactorwatch.diagnosis.difference import Difference
-from reactorwatch.diagnosis.report import pictures
-from reactorwatch.diagnosis.report.equations import balances, meanings
-from reactorwatch.diagnosis.report.words import (
+from reactorwatch.diagnosis.report import mathml, panels
+from reactorwatch.diagnosis.report.equations import Equation, balances, meanings
+from reactorwatch.diagnosis.result import AMBIGUOUS, NOMINAL, Cause, Diagnosis, Experiment
+from reactorwatch.diagnosis.whiteness import WHITE
+from reactorwatch.process import MODELS
+from reactorwatch.process.effect import Effect
+from reactorwatch.process.model import ProcessModel
+from reactorwatch.process.profiles import FREE_NAME, PROFILES
+from reactorwatch.sentences.diagnosis import (
     describe_causes,
     describe_difference,
     describe_location,
@@ -23,12 +31,9 @@ from reactorwatch.diagnosis.report.words import (
     format_interval,
     law_rows,
 )
-from reactorwatch.diagnosis.result import AMBIGUOUS, NOMINAL, Cause, Diagnosis, Experiment
-from reactorwatch.diagnosis.whiteness import WHITE
-from reactorwatch.process import MODELS
-from reactorwatch.process.effect import Effect
-from reactorwatch.process.model import ProcessModel
-from reactorwatch.process.profiles import FREE_NAME, PROFILES
+
+PRINTED = 80
+"""Signs of an equation that fit on a line of A4 in 11 pt, as Chromium draws them."""
 
 _PAGES = jinja2.Environment(
     loader=jinja2.PackageLoader("reactorwatch.diagnosis", "report"),
@@ -88,19 +93,21 @@ def as_page(
         numbers=lambda cause: _parameters(cause, effects),
         parameter=describe_parameter,
         meanings=meanings(causing),
-        equations=balances(model, causing),
-        outputs=pictures.outputs(diagnosis, model),
-        closer=pictures.closer(diagnosis, model) if diagnosis.causes else [],
-        courses=pictures.courses(diagnosis),
-        unknown=pictures.unknown_course(diagnosis),
-        law=pictures.law(diagnosis),
+        equations=[_wrap(equation) for equation in balances(model, causing)],
+        style=html.style(),
+        figure=html.figure,
+        outputs=panels.outputs(diagnosis, model),
+        closer=panels.closer(diagnosis, model) if diagnosis.causes else [],
+        courses=panels.courses(diagnosis),
+        unknown=panels.unknown_course(diagnosis),
+        law=panels.law(diagnosis),
         law_rows=[] if diagnosis.law is None else law_rows(diagnosis.law),
         extended=diagnosis.is_extended,
-        residuals=pictures.residuals(diagnosis, model),
+        residuals=panels.residuals(diagnosis, model),
         differences=[(describe_difference(name, item), _strips(item)) for name, item in diagnosis.differences.items()],
         white=WHITE,
         evidence=_evidence(diagnosis, effects),
-        experiment=[] if diagnosis.experiment is None else pictures.experiment(diagnosis.experiment, model),
+        experiment=[] if diagnosis.experiment is None else panels.experiment(diagnosis.experiment, model),
         experiment_file=experiment_file,
         experiment_command=_experiment_command(diagnosis.experiment, experiment_file, model.name),
         model_file=model_file,
@@ -109,6 +116,14 @@ def as_page(
         error=lambda value: f"{value:.3g}" if isfinite(value) else "ran away",
         percent=lambda share: "over 99 %" if share > 0.99 else f"{100.0 * share:.0f} %",
     )
+
+
+def _wrap(equation: Equation) -> tuple[list[str], float]:
+    """Terms of an equation, between which it wraps, and the size of its text in print at which the longest fits."""
+    first, *terms = mathml.wrappable(equation.right)
+    parts = [f"{equation.left}<mo>=</mo>{first}" if equation.left else first, *terms]
+    longest = max(len(re.sub("<[^>]*>", "", part)) for part in parts)
+    return parts, min(1.0, PRINTED / longest)
 
 
 def _parameters(cause: Cause, effects: Sequence[Effect]) -> list[tuple[str, str]]:

@@ -1,7 +1,7 @@
 """Search for two simultaneous causes.
 
 Two deviations together can look like a third one, so that the best single cause is neither of them. So all pairs are
-screened together (`pair_screen`) about the run of the best single cause, and the best are fitted roughly, with curves
+screened together (`PairScreen`) about the run of the best single cause, and the best are fitted roughly, with curves
 of any shape. In the best of these each cause then gets its simplest adequate profile, and all pairs are screened again
 about its run, where the linearisation holds.
 
@@ -20,7 +20,12 @@ import numpy as np
 from reactorwatch.diagnosis.fitting.fault_filter import FilterEvaluation, huber_clip
 from reactorwatch.diagnosis.fitting.hypothesis import MOST_STEPS, Hypothesis
 from reactorwatch.diagnosis.fitting.profiles import Constant, PiecewiseLinear, Signal
-from reactorwatch.diagnosis.search.pair_screen import CandidatePair, DynamicSignature, PairScreen, can_be_together
+from reactorwatch.diagnosis.search.dynamic_and_pair_screens import (
+    CandidatePair,
+    DynamicSignature,
+    PairScreen,
+    can_be_together,
+)
 from reactorwatch.diagnosis.search.screen import KNOTS, Candidate, Part
 from reactorwatch.diagnosis.search.search import IN_QUESTION, FittedHypothesis, Label, Search, SearchResult, keep_best
 from reactorwatch.diagnosis.whiteness import DOUBTFUL, minus_log10_p

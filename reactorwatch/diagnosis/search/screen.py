@@ -5,21 +5,26 @@ alternatives have to explain the same data instead of it. About a good fit the l
 noise hides what separates the alternatives. About the nominal model that noise has absorbed the deviation, and only
 causes that stand out are found.
 
-Effects with internal states, such as a lag, have no infinitesimal deviation; see `dynamic_effects_screen`.
+Effects with internal states, such as a lag, have no infinitesimal deviation; see `dynamic_and_pair_screens`.
+
+Effects with other values of their own constants, so that a screen sees what those values do. A screen is linear about
+the nominal constants, and a side reaction with twice the heat does something else. So an effect is also screened at the
+start values of its constants, and a candidate takes them along.
 """
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from itertools import product
 from math import inf, log
 from typing import TypeVar
 
+import casadi as ca
 import numpy as np
 
 from reactorwatch.arrays import Array
 from reactorwatch.diagnosis.fitting import signatures
 from reactorwatch.diagnosis.fitting.augmented_model import augment_model
-from reactorwatch.diagnosis.fitting.bounded_least_squares import solve_bounded
 from reactorwatch.diagnosis.fitting.fault_filter import FaultFilter, error_dynamics_between, huber_clip
 from reactorwatch.diagnosis.fitting.hypothesis import Fit, Hypothesis
 from reactorwatch.diagnosis.fitting.profiles import (
@@ -32,11 +37,51 @@ from reactorwatch.diagnosis.fitting.profiles import (
     Sine,
     Step,
 )
+from reactorwatch.diagnosis.fitting.signatures import solve_bounded
 from reactorwatch.diagnosis.run import Run
-from reactorwatch.diagnosis.search.constant_variants import ConstantVariant, variants_of
 from reactorwatch.kalman.error_dynamics import ErrorDynamics, ErrorLinearization
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.model import MODEL_CACHE_SIZE, ProcessModel
+
+
+class ConstantVariant(Effect):
+    """An effect with fixed values of its own constants.
+
+    Args:
+        effect: the effect.
+        values: values of its constants.
+
+    Attributes:
+        effect: the effect as given.
+        values: the values as given.
+    """
+
+    def __init__(self, effect: Effect, values: Sequence[float]) -> None:
+        self.effect, self.values = effect, tuple(values)
+        facts = {"name": f"{effect.name}@{','.join(f'{value:g}' for value in values)}"}
+        facts |= {name: getattr(effect, name) for name in ("label", "location", "unit", "lower", "upper", "typical")}
+        for name, value in facts.items():
+            setattr(self, name, value)
+
+    def apply(self, model: ProcessModel, size: ca.SX) -> ProcessModel:
+        """See `Effect`."""
+        prefix, extended = self.effect.prefix(model), self.effect.apply(model, size)
+        names = [f"{prefix}.{item.name}" for item in self.effect.constants]
+        for name, value in zip(names, self.values, strict=True):
+            extended = extended.substitute(extended.parameter(name).symbol, ca.SX(value))
+        return replace(extended, parameters=tuple(item for item in extended.parameters if item.name not in names))
+
+
+@lru_cache(maxsize=MODEL_CACHE_SIZE)
+def variants_of(effects: tuple[Effect, ...]) -> tuple[ConstantVariant, ...]:
+    """Variants of effects, at every combination of the start values of their constants; made once."""
+    return tuple(
+        ConstantVariant(effect, values)
+        for effect in effects
+        if effect.constants
+        for values in product(*(item.start_values for item in effect.constants))
+    )
+
 
 KNOTS = 12
 DECAYS = (0.02, 0.1, 0.4)

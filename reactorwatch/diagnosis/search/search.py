@@ -16,16 +16,15 @@ from typing import TypeAlias
 import numpy as np
 
 from reactorwatch.arrays import Array
-from reactorwatch.diagnosis.fitting import grid_search, onset_refinement
 from reactorwatch.diagnosis.fitting.colored_noise import Noise, detect_colored_noise
 from reactorwatch.diagnosis.fitting.fault_filter import FaultFilter, FilterEvaluation
-from reactorwatch.diagnosis.fitting.hypothesis import MOST_STEPS, Fit, Hypothesis
-from reactorwatch.diagnosis.fitting.knot_selection import GRID, select_knots
+from reactorwatch.diagnosis.fitting.hypothesis import MOST_STEPS, Fit, Hypothesis, prior_cost
 from reactorwatch.diagnosis.fitting.outliers import find_gross_outliers, find_outliers, remove_outliers
 from reactorwatch.diagnosis.fitting.profiles import LateSine, PiecewiseLinear, Signal, Sine
+from reactorwatch.diagnosis.fitting.refinement import GRID, refine_onset, select_knots
+from reactorwatch.diagnosis.fitting.refinement import fit_hypothesis as scan_and_fit
 from reactorwatch.diagnosis.run import Run
-from reactorwatch.diagnosis.search.cause_prior import prior_cost
-from reactorwatch.diagnosis.search.dynamic_effects_screen import DynamicEffectsScreen
+from reactorwatch.diagnosis.search.dynamic_and_pair_screens import DynamicEffectsScreen
 from reactorwatch.diagnosis.search.screen import Candidate, Part, Screen, first_of_each
 from reactorwatch.kalman.noise_estimation import resolution_sd
 from reactorwatch.process.effect import Effect
@@ -371,13 +370,9 @@ class Search:
     def fit(
         self, hypothesis: Hypothesis, start: Sequence[Array], steps: int = MOST_STEPS, scan: bool = True
     ) -> FittedHypothesis:
-        """Fit a hypothesis, by `grid_search` where its effects are discontinuous and `scan` is set."""
-        best = (
-            grid_search.fit_hypothesis(self.run, hypothesis, start, steps)
-            if scan
-            else hypothesis.fit(self.run, start, steps)
-        )
-        return self.score_fit(hypothesis, onset_refinement.refine_onset(self.run, hypothesis, best, steps))
+        """Fit a hypothesis, by `refinement.fit_hypothesis` where its effects are discontinuous and `scan` is set."""
+        best = scan_and_fit(self.run, hypothesis, start, steps) if scan else hypothesis.fit(self.run, start, steps)
+        return self.score_fit(hypothesis, refine_onset(self.run, hypothesis, best, steps))
 
     def _is_distant(self, candidate: Candidate, best: FittedHypothesis) -> bool:
         """Return true if a candidate with the best's cause and profile starts far from its fit."""

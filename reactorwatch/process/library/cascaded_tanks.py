@@ -19,13 +19,10 @@ from functools import cache
 import casadi as ca
 
 from reactorwatch.process.effect import Effect, EffectConstant, ParameterEffect
+from reactorwatch.process.law import INPUT, SENSOR, SOURCE
 from reactorwatch.process.model import Output, Place, ProcessModel, new_clock, parameter, variable
 from reactorwatch.process.operation import Example, InputLevels, Operation
-from reactorwatch.process.places import INPUT, SENSOR, SOURCE
 from reactorwatch.process.signal_effects import OutputBias
-
-SMALL_LEVEL_V = 0.01
-"""Level in V below which its root is replaced by a straight line; at 1 V that changes it by less than 3 in 100,000."""
 
 UPPER_OUTLET = "upper outlet"
 """Name of the term that runs from the upper tank, in V^0.5: the root of its level."""
@@ -77,7 +74,7 @@ def root(level: ca.SX, power: ca.SX | None = None) -> ca.SX:
         level: the level in V.
         power: the power; None: 0.5.
     """
-    square = level**2 + SMALL_LEVEL_V**2
+    square = level**2 + 0.01**2  # straight below 0.01 V; at 1 V that changes the root by less than 3 in 100,000
     return level / (ca.sqrt(ca.sqrt(square)) if power is None else square ** (0.5 - 0.5 * power))
 
 

@@ -19,8 +19,8 @@ from functools import cache
 import casadi as ca
 
 from reactorwatch.process.effect import TIMING, Effect, EffectConstant, ParameterEffect, ParameterShift
+from reactorwatch.process.law import CAPACITY, FACTOR, INPUT, SENSOR, SOURCE
 from reactorwatch.process.model import Output, Place, ProcessModel, new_clock, parameter, variable
-from reactorwatch.process.places import CAPACITY, FACTOR, INPUT, SENSOR, SOURCE
 from reactorwatch.process.signal_effects import (
     InputGain,
     InputLag,
@@ -32,9 +32,6 @@ from reactorwatch.process.signal_effects import (
     OutputLag,
     add_lag,
 )
-
-SMALLEST_COOLANT_FLOW = 1e-6
-"""l/min. A smaller flow counts as this: K2 qc (1 - exp(-K3/qc)) goes to zero with qc, but K3/qc is undefined there."""
 
 OPERATING_COOLANT_FLOW = 103.41
 """l/min. The flow whose steady state on the operating branch is C = 0.1 mol/l, T = 438.54 K."""
@@ -99,7 +96,7 @@ def cstr() -> ProcessModel:
     K3 = parameter("K3", 700.0, "l/min", (0.0, 1e5), "heat transfer coefficient times area over coolant heat capacity")
 
     arrhenius = ca.exp(-E_R.symbol / T.symbol)
-    flow = ca.fmax(qc.symbol, SMALLEST_COOLANT_FLOW)
+    flow = ca.fmax(qc.symbol, 1e-6)  # K2 qc (1 - exp(-K3/qc)) goes to zero with qc, but K3/qc is undefined there
     cooling = K2.symbol * flow * (1 - ca.exp(-K3.symbol / flow))
     dilution = q.symbol / V.symbol
     to_coolant = cooling * (Tcf.symbol - T.symbol)

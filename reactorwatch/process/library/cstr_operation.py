@@ -186,7 +186,7 @@ EXAMPLES = {
 }
 """The sample records, by name: four hours at the plant's period of 0.1 min."""
 
-ONSET_MIN = 220.0
+ONSET_MIN = 220.0  # of the faults of named runs: two hours after the training
 NOISE_SD = {"C": 0.002, "T": 0.3, "qc": 0.0}
 
 

@@ -21,13 +21,10 @@ from typing import ClassVar
 import casadi as ca
 
 from reactorwatch.process.effect import Effect, ParameterEffect
+from reactorwatch.process.law import FACTOR, SENSOR, SOURCE
 from reactorwatch.process.model import Output, Place, ProcessModel, new_clock, parameter, variable
 from reactorwatch.process.operation import Controller, Example, InputLevels, Operation
-from reactorwatch.process.places import FACTOR, SENSOR, SOURCE
 from reactorwatch.process.signal_effects import InputOffset, OutputBias
-
-SMALL_LEVEL_CM = 0.01
-"""Difference of levels below which the root becomes a straight line; at 1 cm that changes it by 3 in 100,000."""
 
 PLACES = (
     Place("pipe13", "pipe13", FACTOR, flows={"h1": "flow 13", "h3": "inflow 13"}, variables=("head 13",)),
@@ -103,7 +100,8 @@ def leak_name(tank: int) -> str:
 
 def signed_root(head: ca.SX) -> ca.SX:
     """Root of a difference of levels with its sign, and a straight line where it is nearly zero."""
-    return head / ca.sqrt(ca.sqrt(head**2 + SMALL_LEVEL_CM**2))
+    # Straight below 0.01 cm; at 1 cm that changes the root by 3 in 100,000.
+    return head / ca.sqrt(ca.sqrt(head**2 + 0.01**2))
 
 
 class Leak(Effect):

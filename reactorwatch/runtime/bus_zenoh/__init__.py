@@ -14,7 +14,13 @@ would otherwise be dropped in part; and a link that takes nothing for `STUCK_S` 
 """
 
 from reactorwatch.runtime.bus_zenoh.bus import ZenohBus
-from reactorwatch.runtime.bus_zenoh.refusal_log import log_refusals
-from reactorwatch.runtime.bus_zenoh.sessions import LEASE_S, connect, connect_now, router, router_from_file
+from reactorwatch.runtime.bus_zenoh.sessions import (
+    LEASE_S,
+    connect,
+    connect_now,
+    log_refusals,
+    router,
+    router_from_file,
+)
 
 __all__ = ["LEASE_S", "ZenohBus", "connect", "connect_now", "log_refusals", "router", "router_from_file"]

@@ -6,17 +6,15 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator
-from dataclasses import dataclass
-from math import isfinite
 from typing import Any, Unpack
 
 import structlog
 import zenoh
 import zenoh.ext
-from google.protobuf.message import Message
 
 from reactorwatch.contract import keys
-from reactorwatch.contract.codec import Encoded, encode_message
+from reactorwatch.contract.codec import Encoded
+from reactorwatch.runtime.acl import CACHE_SUFFIX, NO_QUERYABLE
 from reactorwatch.runtime.bus import MAX_BATCH, Request, SubscribeOptions
 from reactorwatch.runtime.bus_zenoh.messages import (
     MAX_ENCODING,
@@ -24,41 +22,32 @@ from reactorwatch.runtime.bus_zenoh.messages import (
     WILDCARD,
     ReadSample,
     SampleReader,
+    ZenohRequest,
+    cache_size,
     first_line,
+    history_selector,
     matches_whole_streams,
+    read_batch,
     truncated_payload,
     zenoh_expression,
 )
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.delivery import STREAM_PARTS, Delivery, SequencedMessage, keys_of, stream_of
 from reactorwatch.runtime.reorder_buffer import Gap, ReorderBuffer
-from reactorwatch.runtime.security.acl import CACHE_SUFFIX, NO_QUERYABLE
 
 log = structlog.get_logger()
 
-FLUSH_WITHIN_S = 10.0
-HEARTBEAT_S = 0.5
-EVERY_ROW = frozenset({keys.SAMPLE, keys.ESTIMATE, keys.RECONSTRUCTION, keys.CHART})
-"""Kinds published with every row, apart from `RARE_CHARTS`. Others would keep `cache_messages` filled for days."""
-RARE_CHARTS = frozenset({"parameters"})
+HEARTBEAT_S = 0.5  # of a publisher, by which a subscriber notices that the last messages are missing
 PRIORITY = zenoh.Priority.DATA_HIGH
 """Above Zenoh's default, so that publishers that are no nodes do not fill the queues of a link."""
-MAX_CACHED_OF_OTHERS = 600
-"""Messages cached on each key of another kind: those of `history_s` at one a plant minute and `--speed 600`."""
-LAST_RECOVERY_S = 1.0  # a bus stays open after its last message, so that it can be recovered
 MAX_INCIDENTS = 100
 """Incidents of a plant whose last message is cached: each is a key of its own, and a plant goes on for years."""
 MAX_NEW_KEYS, NEW_KEYS_PER_S = 1000, 100
 """Keys of uncached kinds that are declared at once, and in each second after that."""
-BATCH_PERIOD_S = 0.005
-LOG_INTERVAL_S = 60.0
-MAX_CHANNEL = 5 * MAX_BATCH
-MAX_BATCH_BYTES = 1 << 20
 
 LAST = "_max=1"
 """Selector of the last message that a publisher caches on each key."""
-HISTORY_WITHIN_S = 10.0
-MAX_TRANSIT_S = 5.0  # of a message; a missing one was published at most this long before its predecessor arrived
+HISTORY_WITHIN_S = 10.0  # in which Zenoh, too, gives a query up
 LAST_QUERY_PERIOD_S = 20.0
 """Period of queries for the last number on each key, on a bus with certificates.
 
@@ -67,24 +56,6 @@ another role's publisher, on its own keys, makes the subscriber silently drop th
 replies of publishers bypass the subscriber, and show which are missing.
 """
 MAX_QUERIES = 4  # of caches, while a publisher does not reply in time
-
-
-@dataclass(frozen=True)
-class ZenohRequest:
-    """A query from the network."""
-
-    query: zenoh.Query
-    question: Encoded
-
-    def reply(self, message: Message) -> None:
-        """See `Request`."""
-        payload, encoding = encode_message(message)
-        self.query.reply(self.question.key, payload, encoding=encoding)
-        self.query.drop()
-
-    def decline(self) -> None:
-        """See `Request`; the client waits until no queryable holds its query any more."""
-        self.query.drop()
 
 
 class ZenohBus:
@@ -184,14 +155,14 @@ class ZenohBus:
         """
         delivery = self._make_delivery(key_expression, handler, options.get("on_gap"))
         # The thread holds the channel alone: a subscriber in use cannot be undeclared.
-        channel = self._declare_subscriber(key_expression, zenoh.handlers.FifoChannel(MAX_CHANNEL)).handler
+        channel = self._declare_subscriber(key_expression, zenoh.handlers.FifoChannel(5 * MAX_BATCH)).handler
 
         def empty() -> None:
             reader = SampleReader()
             with contextlib.suppress(zenoh.ZError):  # it is closed
                 while True:
-                    self._sort_out(_read_batch(channel, reader), delivery, handler)
-                    time.sleep(BATCH_PERIOD_S)
+                    self._sort_out(read_batch(channel, reader), delivery, handler)
+                    time.sleep(0.005)
 
         self._batch_threads.append(threading.Thread(target=empty, name="gather", daemon=True))
         self._batch_threads[-1].start()
@@ -277,7 +248,7 @@ class ZenohBus:
         for _ in range(MAX_QUERIES):
             if not missing:
                 break
-            history, is_complete = self._query_cache(key_expression, _history_selector(since_s))
+            history, is_complete = self._query_cache(key_expression, history_selector(since_s))
             for earlier in history:
                 delivery.add_history(earlier)
             missing = not (is_complete and delivery.history_complete())
@@ -307,7 +278,7 @@ class ZenohBus:
         """See `Bus`."""
         buffer: ReorderBuffer[Encoded] = ReorderBuffer(await_history=True)
         with contextlib.suppress(zenoh.ZError):  # it is closed
-            selector = _history_selector(self._config.history_s)
+            selector = history_selector(self._config.history_s)
             for messages, _ in self._query_caches(key_expression, lambda _waited_s: selector):
                 for sent in messages:
                     buffer.add_history(sent.publisher, sent.stream, sent.message.key, sent.number, sent.message)
@@ -321,7 +292,9 @@ class ZenohBus:
         messages = list[SequencedMessage]()
         try:
             for replies, _ in self._query_caches(
-                keys_of(stream), lambda waited_s: _history_selector(since_s + waited_s + MAX_TRANSIT_S)
+                # a missing message was published at most 5 s before its predecessor arrived
+                keys_of(stream),
+                lambda waited_s: history_selector(since_s + waited_s + 5.0),
             ):
                 messages += replies
         except zenoh.ZError as error:  # the bus is being closed, for instance
@@ -361,7 +334,7 @@ class ZenohBus:
         """Count a message on many keys at once, which no node sends, and log it once a minute."""
         self._wildcards += 1
         now_s = time.monotonic()
-        if self._wildcard_logged_at is None or now_s - self._wildcard_logged_at >= LOG_INTERVAL_S:
+        if self._wildcard_logged_at is None or now_s - self._wildcard_logged_at >= 60.0:
             self._wildcard_logged_at = now_s
             log.warning("refused: a message must be on one key", key=key[:MAX_ENCODING], so_far=self._wildcards)
 
@@ -433,8 +406,8 @@ class ZenohBus:
         """
         self._closed.set()
         if self._published_at is not None:
-            time.sleep(max(0.0, self._published_at + LAST_RECOVERY_S - time.monotonic()))
-        for _ in self._voice.get(NO_QUERYABLE, timeout=FLUSH_WITHIN_S):
+            time.sleep(max(0.0, self._published_at + 1.0 - time.monotonic()))
+        for _ in self._voice.get(NO_QUERYABLE, timeout=10.0):
             pass
         # Advanced ones may outlive the session otherwise, and hang the process (eclipse-zenoh/zenoh-python#624).
         for declared in (
@@ -452,36 +425,7 @@ class ZenohBus:
         # A thread that is in Zenoh's code when the interpreter ends aborts the process: "exception not rethrown".
         for thread in self._batch_threads:
             if thread is not threading.current_thread():
-                thread.join(FLUSH_WITHIN_S)
-
-
-def cache_size(key: str, cache_messages: int) -> int:
-    """Number of messages that a publisher caches on a key.
-
-    Args:
-        key: the key.
-        cache_messages: number of messages cached on a key that is published with every row.
-    """
-    topic = keys.parse(key)
-    is_of_every_row = topic is not None and topic.kind in EVERY_ROW and topic.name.split("/")[0] not in RARE_CHARTS
-    return cache_messages if is_of_every_row else min(cache_messages, MAX_CACHED_OF_OTHERS)
-
-
-def _read_batch(channel: Any, reader: SampleReader) -> list[ReadSample]:
-    """Wait for a sample, and read it and those that have arrived until then."""
-    sample, now_ns = channel.recv(), time.time_ns()
-    batch, room = list[ReadSample](), MAX_BATCH_BYTES
-    while sample is not None:
-        read = reader.read(sample, now_ns)
-        batch.append(read)
-        room -= len(read[1][1])  # of its payload
-        sample = channel.try_recv() if len(batch) < MAX_BATCH and room > 0 else None
-    return batch
-
-
-def _history_selector(seconds: float) -> str:
-    """Selector for a publisher's cache."""
-    return f"_time=[now(-{seconds}s)..]" if isfinite(seconds) else ""
+                thread.join(10.0)
 
 
 def _log_gap(gap: Gap) -> None:

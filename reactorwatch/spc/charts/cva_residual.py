@@ -19,8 +19,8 @@ import numpy as np
 
 from reactorwatch.arrays import Array
 from reactorwatch.spc.charts.base import Setting
-from reactorwatch.spc.statistics_chart import EXPLAINED, Model, StatisticsChart, standardise
-from reactorwatch.spc.value_chart import ValueBaseline
+from reactorwatch.spc.charts.pca import EXPLAINED, standardise
+from reactorwatch.spc.charts.value_chart import Model, StatisticsChart, ValueBaseline
 
 ROWS = 3
 """Rows of the past and of the future."""

@@ -62,8 +62,8 @@ from reactorwatch.spc.run_length import (
 )
 from reactorwatch.stored_state import Memory
 
-SMALLEST_WEIGHT, SMALLEST_WEIGHT_WITHOUT_SHIFT = 0.01, 1e-4
-"""Smallest weights whose run length is computed: without a shift there is one dimension, with far fewer nodes."""
+SMALLEST_WEIGHT_WITHOUT_SHIFT = 1e-4
+"""Smallest weight whose run length is computed: without a shift there is one dimension, with far fewer nodes."""
 
 LARGEST_LIMIT = 200.0
 """Largest limit whose run length after a shift is computed: the nodes of its two dimensions grow with it."""
@@ -157,7 +157,7 @@ class Mewma(JointChart):
         """See `Chart`."""
         weight = fastest_parameter(
             lambda w: mewma_run_length(shift, dimension, w, mewma_limit(arl0, dimension, w)),
-            max(SMALLEST_WEIGHT, min(0.03 * shift**1.4, 0.2)),
+            max(0.01, min(0.03 * shift**1.4, 0.2)),  # smaller ones need too many nodes in two dimensions
             min(0.4 * shift**1.4, 1.0),
             accuracy=0.03,
         )
@@ -239,7 +239,7 @@ def mewma_run_length(shift: float, dimension: int, weight: float, limit: float, 
     """
     size = shift_size(shift)
     check_range("dimension", dimension, 1, MOST_SHIFTED_SIGNALS if size > 0.0 else MOST_SIGNALS)
-    check_range("weight (lambda)", weight, SMALLEST_WEIGHT if size > 0.0 else SMALLEST_WEIGHT_WITHOUT_SHIFT, 1.0)
+    check_range("weight (lambda)", weight, 0.01 if size > 0.0 else SMALLEST_WEIGHT_WITHOUT_SHIFT, 1.0)
     check_range("limit", positive("limit", limit), 1e-6, LARGEST_LIMIT if size > 0.0 else 500.0)
     if weight == 1.0:
         return t2_run_length(size, dimension, limit)

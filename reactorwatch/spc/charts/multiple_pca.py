@@ -20,14 +20,8 @@ from scipy import special
 
 from reactorwatch.arrays import Array
 from reactorwatch.spc.charts.base import Setting
-from reactorwatch.spc.statistics_chart import Components, Model, StatisticsChart, components_of, parts_of, standardise
-from reactorwatch.spc.value_chart import ValueBaseline
-
-RIDGE = 1e-3
-"""Share of the variance of all rows that each regime has at least, in every direction."""
-
-SEED = 20_261_123
-"""Seed of the first of the starts, which are always the same ones."""
+from reactorwatch.spc.charts.pca import Components, standardise
+from reactorwatch.spc.charts.value_chart import Model, StatisticsChart, ValueBaseline
 
 
 class Mixture(NamedTuple):
@@ -48,7 +42,7 @@ class Mixture(NamedTuple):
         """The mixture that is most likely, given memberships of shape (rows, regimes)."""
         counts = memberships.sum(axis=0)
         means = memberships.T @ rows / counts[:, None]
-        ridge = RIDGE * np.diag(rows.var(axis=0))
+        ridge = 1e-3 * np.diag(rows.var(axis=0))  # least variance of a regime, of that of all rows, in every direction
         off = rows[None] - means[:, None]
         covariances = np.einsum("ng,gni,gnj->gij", memberships, off, off) / counts[:, None, None] + ridge
         return cls(counts / len(rows), means, np.linalg.inv(np.linalg.cholesky(covariances)))
@@ -81,7 +75,8 @@ def fit_mixture(rows: Array, regimes: int, fewest: float) -> Mixture:
     least = _bic(best, rows)
     for count in range(2, regimes + 1):
         for start in range(4):
-            mixture = maximise(rows, divide(rows, count, np.random.default_rng(SEED + start)), fewest)
+            rng = np.random.default_rng(20_261_123 + start)  # always the same starts
+            mixture = maximise(rows, divide(rows, count, rng), fewest)
             if mixture is not None and _bic(mixture, rows) < least:
                 best, least = mixture, _bic(mixture, rows)
     return best
@@ -157,7 +152,10 @@ class MultiplePca(StatisticsChart):
         z = (window[-1] - model["centre"]) / model["scale"]
         memberships = memberships_of(model, z)
         regimes = zip(model["centres"], model["loadings"], model["variances"], model["rests"], strict=True)
-        parts = [m * parts_of(z - mean, *rest) for m, (mean, *rest) in zip(memberships, regimes, strict=True)]
+        parts = [
+            m * Components(loadings, loadings, *rest).relative_parts(z - mean)
+            for m, (mean, loadings, *rest) in zip(memberships, regimes, strict=True)
+        ]
         return np.asarray(sum(parts))
 
     def explain(self) -> tuple[str, dict[str, float]]:
@@ -178,4 +176,4 @@ def weighted_components(z: Array, weights: Array) -> tuple[Array, Components]:
     """Mean and components of rows with weights, shapes (rows, signals) and (rows,)."""
     mean = weights @ z / weights.sum()
     off = z - mean
-    return mean, components_of((off * weights[:, None]).T @ off / weights.sum())
+    return mean, Components.principal((off * weights[:, None]).T @ off / weights.sum())

@@ -15,17 +15,11 @@ import numpy as np
 
 from reactorwatch.arrays import Array
 from reactorwatch.spc.charts.base import Setting, SignalSetting
-from reactorwatch.spc.statistics_chart import Model, StatisticsChart, components_of, parts_of
-from reactorwatch.spc.value_chart import BLOCKS, ValueBaseline
+from reactorwatch.spc.charts.pca import Components
+from reactorwatch.spc.charts.value_chart import BLOCKS, Model, StatisticsChart, ValueBaseline
 
 STAGES = 20
 """Number of intervals of a batch; courses are linear within one."""
-
-FALL = 0.5
-"""Fall of the progress, as a share of its range, with which a new batch begins."""
-
-LEAST_SD = 0.1
-"""Least standard deviation at a stage, as a share of that over the whole batch."""
 
 
 class MultiwayPca(StatisticsChart):
@@ -70,15 +64,11 @@ class MultiwayPca(StatisticsChart):
         means = smooth_courses(basis, x)
         total = x.std(axis=0, ddof=1)
         squares = smooth_courses(basis, (x - basis @ means) ** 2)
-        sds = np.sqrt(np.maximum(squares, (LEAST_SD * np.where(total > 0.0, total, 1.0)) ** 2))
+        # A stage has at least a tenth of the standard deviation of the whole batch.
+        sds = np.sqrt(np.maximum(squares, (0.1 * np.where(total > 0.0, total, 1.0)) ** 2))
         z = (x - basis @ means) / (basis @ sds)
-        components = components_of(z.T @ z / len(z))
         courses = {"is_progress": is_progress.astype(np.float64), "nodes": nodes, "courses": means, "course_sds": sds}
-        return courses | {
-            "loadings": components.loadings,
-            "variances": components.variances,
-            "rest": np.array([components.rest]),
-        }
+        return courses | Components.principal(z.T @ z / len(z))._asdict()
 
     @classmethod
     def parts(cls, model: Model, window: Array) -> Array:
@@ -92,7 +82,7 @@ class MultiwayPca(StatisticsChart):
         )
         z = (window[-1][~is_progress] - mean) / sd
         parts = np.zeros((2, is_progress.size))
-        parts[:, ~is_progress] = parts_of(z, model["loadings"], model["variances"], float(model["rest"][0]))
+        parts[:, ~is_progress] = Components.of(model).relative_parts(z)
         return parts
 
     def fill(self, x: Array) -> Array | None:
@@ -107,7 +97,7 @@ def progress_of(baseline: ValueBaseline) -> Array:
 
 def batch_starts(progress: Array) -> list[int]:
     """First row of each batch."""
-    falls = np.flatnonzero(np.diff(progress) < -FALL * np.ptp(progress)) + 1
+    falls = np.flatnonzero(np.diff(progress) < -0.5 * np.ptp(progress)) + 1  # a fall by half its range begins a batch
     starts: list[int] = [0, *falls.tolist()]
     return starts
 

@@ -80,15 +80,6 @@ from reactorwatch.spc.charts.mewma import LARGEST_LIMIT, SMALLEST_WEIGHT_WITHOUT
 from reactorwatch.spc.run_length import LONGEST_DESIGN, SHORTEST_DESIGN, check_range
 from reactorwatch.stored_state import Memory
 
-LEAST_EXCITATION = 1e-10
-"""A direction whose mean square is below this share of the largest is not excited, regressors brought to unit size."""
-
-SMALLEST_SD = 1e-9
-"""Smallest standard deviation of the residual, in scaled units: without any noise rounding would count as drift."""
-
-ROWS_A_DIRECTION = 10
-"""Smallest memory of the adaptive model, in rows a direction; with less, H is not the average in memory."""
-
 FIRST_HEIGHT = 0.5
 """Smallest limit: its rate of false alarms exceeds any that is asked for."""
 
@@ -306,14 +297,14 @@ def learn(
     if vectors < 2 * m:  # fewer determine no covariance of m directions
         least = (2 * m / 0.4) ** 1.5
         raise InputError(f"training must have at least {least:.0f} rows for {m} parameters, got {rows}")
-    check_range(
-        "forgetting", forgetting, max(0.9, 1.0 - 1.0 / (ROWS_A_DIRECTION * m)), 1.0 - SMALLEST_WEIGHT_WITHOUT_SHIFT
-    )
+    # With fewer than 10 rows a direction in memory, H is not their average.
+    check_range("forgetting", forgetting, max(0.9, 1.0 - 1.0 / (10 * m)), 1.0 - SMALLEST_WEIGHT_WITHOUT_SHIFT)
     weight = adaptive_weight(forgetting)
 
     z = phi @ white.T
     e = (e - z @ (z.T @ e) / rows) * sqrt(rows / (rows - m))
-    omega = _long_run_covariance(z * e[:, None], vectors) + SMALLEST_SD**2 * np.eye(m)
+    # Without any noise rounding would count as drift.
+    omega = _long_run_covariance(z * e[:, None], vectors) + 1e-9**2 * np.eye(m)
     memory = forgetting**reference_rows
     share = (1.0 + memory) / (1.0 - memory)
     # In coordinates that make the regressors white, V is Omega.
@@ -337,7 +328,7 @@ def _whitening(rows: Array) -> Array:
     unit = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0.0)
     scaled = rows * unit
     values, directions = np.linalg.eigh(scaled.T @ scaled / len(rows))
-    kept = values > LEAST_EXCITATION * max(values[-1], LEAST_EXCITATION)
+    kept = values > 1e-10 * max(values[-1], 1e-10)  # a smaller share of the largest is not excited
     return np.asarray((directions[:, kept] / np.sqrt(values[kept])).T * unit)
 
 

@@ -16,10 +16,12 @@ SPE, with th_i = sum of l_j^i over the components left out, h = 1 - 2 th_1 th_3 
 by the moments of a sum of chi-squares:
 
     th_1 (1 + c sqrt(2 th_2 h^2) / th_1 + th_2 h (h - 1) / th_1^2)^(1/h).
+
+`Components` are also the model of the charts whose T2 and SPE are averaged: `pls`, `multiple_pca`, `multiway_pca`.
 """
 
-from collections.abc import Sequence
-from typing import Self
+from collections.abc import Mapping, Sequence
+from typing import ClassVar, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -31,25 +33,79 @@ from reactorwatch.spc.charts.t2 import T2
 from reactorwatch.spc.false_alarm_budget import TrainingErrors
 from reactorwatch.stored_state import Memory
 
+EXPLAINED = 0.9
+"""Share of the variance that principal components have, and of the squared canonical correlations a state."""
+
+
+class Components(NamedTuple):
+    """Components of centred signals x: the scores t = R' x, and P t, what they explain of x.
+
+    Attributes:
+        rotations: R, shape (signals, components); equal to the loadings for principal components.
+        loadings: P, same shape.
+        variances: variance of each score, shape (components,); one without variance counts for nothing.
+        rest: variance that they leave, of all signals together, shape (1,).
+    """
+
+    rotations: Array
+    loadings: Array
+    variances: Array
+    rest: Array
+
+    @classmethod
+    def principal(cls, covariance: Array) -> Self:
+        """The fewest principal components that explain `EXPLAINED` of the variance; at least one direction is left."""
+        values, vectors = np.linalg.eigh(covariance)
+        values, vectors = np.maximum(values[::-1], 0.0), vectors[:, ::-1]
+        shares = np.cumsum(values) / values.sum()
+        count = min(int(np.searchsorted(shares, EXPLAINED) + 1), len(values) - 1)
+        rest = max(float(values[count:].sum()), 1e-12 * float(values.sum()))
+        loadings = np.ascontiguousarray(vectors[:, :count])
+        return cls(loadings, loadings, values[:count], np.array([rest]))
+
+    @classmethod
+    def of(cls, model: Mapping[str, Array]) -> Self:
+        """Components among the arrays of a model, by name."""
+        return cls(*(model[name] for name in cls._fields))
+
+    def parts(self, x: Array) -> Array:
+        """Each signal's part of T2 and of SPE of a row of shape (signals,), shape (2, signals).
+
+        x_j (R l^-1 t)_j, of which one may be negative, and the squared residuals.
+        """
+        scores, used = x @ self.rotations, self.variances > 0.0
+        weighted = np.where(used, scores / np.where(used, self.variances, 1.0), 0.0)
+        return np.array([x * (self.rotations @ weighted), (x - self.loadings @ scores) ** 2])
+
+    def relative_parts(self, x: Array) -> Array:
+        """The same, of T2 and SPE divided by their means."""
+        used = max(int(np.count_nonzero(self.variances > 0.0)), 1)
+        return np.asarray(self.parts(x) / [[used], self.rest])
+
+
+def standardise(values: Array) -> tuple[Array, Array, Array]:
+    """Mean and standard deviation of each signal, 1 for a constant one, and the scaled deviations of the rows."""
+    centre, scale = values.mean(axis=0), values.std(axis=0, ddof=1)
+    scale = np.where(scale > 0.0, scale, 1.0)
+    return centre, scale, (values - centre) / scale
+
 
 class PcaModel(Memory):
     """PCA model of related signals: the full memory of the two charts.
 
     Attributes:
-        mean: mean of each signal, length p.
-        scale: standard deviation of each signal, length p.
-        loadings: p rows of a numbers, orthonormal columns.
+        mean: mean of each signal, shape (p,).
+        scale: standard deviation of each signal, shape (p,).
+        loadings: shape (p, a), orthonormal columns.
         variances: all p eigenvalues of the correlation matrix, falling.
-        rows: number n of rows of the training.
         t2_limit: limit of T2.
         spe_limit: limit of SPE.
     """
 
-    mean: list[float]
-    scale: list[float]
-    loadings: list[list[float]]
-    variances: list[float]
-    rows: int
+    mean: Array
+    scale: Array
+    loadings: Array
+    variances: Array
     t2_limit: float
     spe_limit: float
 
@@ -75,36 +131,48 @@ class PcaModel(Memory):
             raise InputError(f"components must be in [1, {p - 1}] for {p} signals, got {a}")
         if n <= p:
             raise InputError(f"training must have more rows than its {p} signals, got {n}")
-        mean, scale = matrix.mean(axis=0), matrix.std(axis=0, ddof=1)
-        still = np.flatnonzero(scale <= 1e-12 * np.abs(mean))
+        mean, scale, scaled = standardise(matrix)
+        still = np.flatnonzero(matrix.std(axis=0) <= 1e-12 * np.abs(mean))
         if still.size:
             raise InputError(f"training must vary in every signal, number {still[0]} does not; leave it out")
-        _, singular, directions = np.linalg.svd((matrix - mean) / scale, full_matrices=False)
+        _, singular, directions = np.linalg.svd(scaled, full_matrices=False)
         variances = singular**2 / (n - 1)
         if variances[a] < 1e-12:
             raise InputError(f"components must leave some variance over, {a} of {p} signals leave none")
         t2 = a * (n * n - 1) / (n * (n - a)) * float(stats.f.isf(false_alarm, a, n - a))
-        spe = _jackson_mudholkar_limit(variances[a:], false_alarm)
-        return cls(mean.tolist(), scale.tolist(), directions[:a].T.tolist(), variances.tolist(), n, t2, spe)
+        loadings = np.ascontiguousarray(directions[:a].T)
+        return cls(mean, scale, loadings, variances, t2, _jackson_mudholkar_limit(variances[a:], false_alarm))
 
 
 class _PcaChart(JointChart):
-    """Base class of the two charts: a model, and no memory."""
+    """Base class of the two charts: a model, and no memory.
+
+    Args:
+        model: from `PcaModel.fit`.
+
+    Raises:
+        ValueError: the model's parts don't fit together.
+    """
 
     memory_type = PcaModel
     has_memory = False
+    statistic: ClassVar[int]  # its index in the parts
 
     def __init__(self, model: PcaModel) -> None:
         self._use(model)
 
     def _use(self, memory: PcaModel) -> None:
         """See `Chart`."""
-        self.memory = self._model = model = memory
-        self._mean, self._scale = np.array(model.mean), np.array(model.scale)
-        self._loadings = np.array(model.loadings)
-        p, a = len(model.mean), len(model.variances)
-        if self._loadings.shape[:1] != (p,) or self._scale.shape != (p,) or a != p or not np.all(self._scale > 0):
+        loadings, variances, p = memory.loadings, memory.variances, memory.mean.size
+        if loadings.shape[:1] != (p,) or memory.scale.shape != (p,) or variances.shape != (p,):
             raise ValueError(f"the memory must hold loadings, scales and variances of its {p} signals")
+        if not np.all(memory.scale > 0):
+            raise ValueError(f"scales must be positive, got {memory.scale.tolist()}")
+        a = loadings.shape[1]
+        self.memory = memory
+        self._components = Components(loadings, loadings, variances[:a], np.array([variances[a:].sum()]))
+        self._centre = (float(a), float(variances[a:].sum()))[self.statistic]
+        self._limit = (memory.t2_limit, memory.spe_limit)[self.statistic]
 
     @classmethod
     def design(cls, baseline: Baseline) -> Self:
@@ -123,65 +191,33 @@ class _PcaChart(JointChart):
         """See `JointChart`; they count as those of T2."""
         return T2.relative_rates(baseline, errors)
 
-    def restart(self) -> None:
-        """Do nothing: there is no memory."""
-
-    def _scale_values(self, x: ArrayLike) -> Array:
-        return np.asarray((vector(x, self._mean.size) - self._mean) / self._scale)
-
-
-class PcaT2(_PcaChart):
-    """T2 of the components that the signals have in common.
-
-    Args:
-        model: from `PcaModel.fit`.
-
-    Raises:
-        ValueError: the model's parts don't fit together.
-    """
-
-    name = "pca_t2"
-
-    def _use(self, memory: PcaModel) -> None:
-        """See `Chart`."""
-        super()._use(memory)
-        a = self._loadings.shape[1]
-        self._white: Array = self._loadings / np.sqrt(np.array(memory.variances[:a]))
-
-    def update(self, x: ArrayLike) -> Judgement:
-        """See `Chart`; x has shape (p,)."""
-        scores = self._scale_values(x) @ self._white
-        statistic = float(scores @ scores)
-        return Judgement(statistic, float(scores.size), 0.0, self._model.t2_limit, statistic > self._model.t2_limit)
-
-    def contributions(self, x: ArrayLike) -> Array:
-        """Each signal's part of T2, shape (p,): x_j (P l^-1 P' x)_j. Their sum is T2; one may be negative."""
-        scaled = self._scale_values(x)
-        return np.asarray(scaled * (self._white @ (scaled @ self._white)))
-
-
-class PcaSpe(_PcaChart):
-    """The squared prediction error (also called Q): what the common components do not explain.
-
-    Args:
-        model: from `PcaModel.fit`.
-
-    Raises:
-        ValueError: the model's parts don't fit together.
-    """
-
-    name = "pca_spe"
-
     def update(self, x: ArrayLike) -> Judgement:
         """See `Chart`; x has shape (p,)."""
         statistic = float(self.contributions(x).sum())
-        centre = sum(self._model.variances[self._loadings.shape[1] :])
-        return Judgement(statistic, centre, 0.0, self._model.spe_limit, statistic > self._model.spe_limit)
+        return Judgement(statistic, self._centre, 0.0, self._limit, statistic > self._limit)
 
     def contributions(self, x: ArrayLike) -> Array:
-        """Each signal's part of SPE, shape (p,): its squared residual. Their sum is SPE."""
-        scaled = self._scale_values(x)
-        return np.asarray((scaled - self._loadings @ (scaled @ self._loadings)) ** 2)
+        """See `JointChart`; their sum is the statistic, see `Components.parts`."""
+        memory = self.memory
+        parts = self._components.parts((vector(x, memory.mean.size) - memory.mean) / memory.scale)
+        return np.asarray(parts[self.statistic])
+
+    def restart(self) -> None:
+        """Do nothing: there is no memory."""
+
+
+class PcaT2(_PcaChart):
+    """T2 of the components that the signals have in common."""
+
+    name = "pca_t2"
+    statistic = 0
+
+
+class PcaSpe(_PcaChart):
+    """The squared prediction error (also called Q): what the common components do not explain."""
+
+    name = "pca_spe"
+    statistic = 1
 
 
 def _jackson_mudholkar_limit(left_out: Array, alpha: float) -> float:

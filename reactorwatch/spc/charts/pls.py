@@ -20,11 +20,8 @@ import numpy as np
 
 from reactorwatch.arrays import Array
 from reactorwatch.spc.charts.base import Setting, SignalSetting
-from reactorwatch.spc.statistics_chart import Model, StatisticsChart, standardise
-from reactorwatch.spc.value_chart import BLOCKS, ValueBaseline
-
-MOST_COMPONENTS = 8
-"""Largest number of components; there is always one less than signals, so that something is left for SPE."""
+from reactorwatch.spc.charts.pca import Components, standardise
+from reactorwatch.spc.charts.value_chart import BLOCKS, Model, StatisticsChart, ValueBaseline
 
 
 class Projection(NamedTuple):
@@ -107,10 +104,8 @@ class Pls(StatisticsChart):
         """See `StatisticsChart`; quality variables have none."""
         is_x = model["is_quality"] == 0.0
         off = ((window[-1] - model["centre"]) / model["scale"])[is_x]
-        scores = off @ model["rotations"]
         parts = np.zeros((2, is_x.size))
-        parts[0, is_x] = off * (model["rotations"] @ (scores / model["variances"])) / scores.size
-        parts[1, is_x] = (off - model["loadings"] @ scores) ** 2 / model["rest"][0]
+        parts[:, is_x] = Components.of(model).relative_parts(off)
         return parts
 
     def explain(self) -> tuple[str, dict[str, float]]:
@@ -125,8 +120,8 @@ class Pls(StatisticsChart):
 
 
 def choose_components(x: Array, y: Array) -> int:
-    """Number of components with the least squared error of prediction on held-out blocks; at most `MOST_COMPONENTS`."""
-    most = min(MOST_COMPONENTS, x.shape[1] - 1)
+    """Number of components with the least squared error of prediction on held-out blocks; at most 8."""
+    most = min(8, x.shape[1] - 1)  # one less than signals, so that something is left for SPE
     errors = np.zeros(most)
     for first, end in pairwise(np.linspace(0, len(x), BLOCKS + 1).astype(int).tolist()):
         others = np.r_[0:first, end : len(x)]

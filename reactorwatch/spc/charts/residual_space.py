@@ -40,10 +40,8 @@ from reactorwatch.codegen.numba_kernel import Entry, jit
 from reactorwatch.errors import InputError, positive
 from reactorwatch.spc.charts.base import LARGEST_VALUE, Judgement, Setting, vector
 from reactorwatch.spc.charts.ewma import ewma_limit
-from reactorwatch.spc.false_alarm_budget import TrainingErrors, student_tail
-from reactorwatch.spc.value_chart import (
+from reactorwatch.spc.charts.value_chart import (
     BLOCKS,
-    NAMED,
     ValueBaseline,
     ValueChart,
     adjustment,
@@ -51,6 +49,7 @@ from reactorwatch.spc.value_chart import (
     fill_missing,
     student_limit,
 )
+from reactorwatch.spc.false_alarm_budget import TrainingErrors, student_tail
 from reactorwatch.stored_state import Memory
 
 
@@ -175,7 +174,7 @@ class ResidualSpace(ValueChart):
         """See `ValueChart`: shares of the squared averages."""
         squares = self._averages**2
         order = np.argsort(-squares, kind="stable").tolist()
-        parts = [f"{self.names[i]} ({self._averages[i]:+.1f} sd)" for i in order[:NAMED]]
+        parts = [f"{self.names[i]} ({self._averages[i]:+.1f} sd)" for i in order[:3]]
         text = (
             f"the disturbance enters at {self.names[order[0]]}: on average {parts[0]} is unlike what the other signals "
             f"say (allowed: {self.limit:.1f} sd)"

@@ -40,9 +40,6 @@ from reactorwatch.spc.false_alarm_budget import widen_limit
 from reactorwatch.spc.prewhitening import Prewhitening
 from reactorwatch.spc.run_length import check_length, limit_for, run_lengths, shift_size, stationary_distribution
 
-RULES = (1, 2, 3, 4)
-"""Run rules, see above."""
-
 _MEAN, _THIRD, _LOWER, _UPPER, _RULE1, _RULE2, _RULE3, _RULE4, _START = range(SETTINGS, SETTINGS + 9)
 _RUN, _ZONE1, _ZONE2, _ZONE3, _ZONE4, _END = range(_START + 5, _START + 5 + 6)
 
@@ -109,7 +106,7 @@ class Shewhart(CompiledChart):
         positive("width", width)
         wanted = checked_rules(rules)
         lower, upper = finite(mean) - width * sigma, mean + width * sigma
-        flags = [1.0 if rule in wanted else 0.0 for rule in RULES]
+        flags = [1.0 if rule in wanted else 0.0 for rule in (1, 2, 3, 4)]
         super().__init__([mean, width * sigma / 3.0, lower, upper, *flags], np.zeros(5).tolist())
 
     @classmethod
@@ -184,9 +181,6 @@ def shewhart_limit(arl0: float, rules: Iterable[int] = (1,)) -> float:
 State = tuple[tuple[int, ...], tuple[int, ...], int]
 """Sides of the last points beyond the inner line, of those beyond the middle line (0: not beyond), and the run."""
 
-ZONES = ((-3, -1), (-2, -1), (-1, -1), (0, -1), (0, 1), (1, 1), (2, 1), (3, 1))
-"""Zone and side of a point, from the lowest to the highest."""
-
 
 def shewhart_run_length(
     shift: float, width: float = 3.0, rules: Iterable[int] = (1,), *, steady_state: bool = False
@@ -224,7 +218,7 @@ def checked_rules(rules: Iterable[int]) -> tuple[int, ...]:
         InputError: there is none, or one that does not exist.
     """
     wanted = tuple(sorted(set(rules)))
-    if not wanted or not set(wanted) <= set(RULES):
+    if not wanted or not set(wanted) <= {1, 2, 3, 4}:
         raise InputError(f"rules must be some of 1, 2, 3, 4, got {wanted}")
     return wanted
 
@@ -254,7 +248,8 @@ def _transition_table(rules: tuple[int, ...]) -> list[list[int]]:
     while todo:
         state = todo.pop(0)
         targets = []
-        for zone, side in ZONES:
+        # Zone and side of a point, from the lowest to the highest.
+        for zone, side in ((-3, -1), (-2, -1), (-1, -1), (0, -1), (0, 1), (1, 1), (2, 1), (3, 1)):
             target = _next_state(state, zone, side, rules)
             if target is not None and target not in index:
                 index[target] = len(index)

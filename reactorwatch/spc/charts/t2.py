@@ -39,12 +39,6 @@ from reactorwatch.spc.prewhitening import Prewhitening
 from reactorwatch.spc.run_length import check_length, check_range, limit_for, shift_size
 from reactorwatch.stored_state import Memory
 
-GRID = 2**13
-"""Number of grid points of the convolution; the step is then about a thousandth of the quantile."""
-
-MOST_TURNED = 8
-"""Largest number of signals for which errors of correlations are drawn; of more, the limit has them on average."""
-
 
 class T2Memory(Memory):
     """Memory of a T2 chart: the arguments of `T2`."""
@@ -224,7 +218,8 @@ def joint_rates(known: float, weight: float, baseline: Baseline, errors: Trainin
     scale = np.column_stack([errors.true_scale(i, item, weight) for i, item in enumerate(learned)])
     factor = sqrt((2.0 - weight) / weight)
     mean = scale * errors.mean * factor / np.sqrt([float(item.rows) for item in learned])
-    turned = _correlation_errors(count, rows) if count <= MOST_TURNED else np.tile(np.eye(count), (DRAWS, 1, 1))
+    # Of more signals the limit has the errors of correlations on average.
+    turned = _correlation_errors(count, rows) if count <= 8 else np.tile(np.eye(count), (DRAWS, 1, 1))
     covariance = scale[:, :, None] * turned * scale[:, None, :]
     sizes, directions = np.linalg.eigh(covariance)
     shifts = np.einsum("dij,di->dj", directions, mean) / np.sqrt(sizes)
@@ -279,9 +274,10 @@ def _factor(p: int, rows: float) -> tuple[Array, Array]:
 
 def _sum_tail(freedoms: tuple[float, ...], reach: float) -> tuple[Array, Array]:
     """A grid up to `reach`, and the logarithm of the probability that the sum of F(1, nu_i) is beyond each point."""
-    step = reach / GRID
-    at: Array = step * np.arange(GRID + 2, dtype=np.float64)
-    transform = np.ones(GRID + 1, dtype=np.complex128)
+    points = 2**13  # the step is about a thousandth of the quantile
+    step = reach / points
+    at: Array = step * np.arange(points + 2, dtype=np.float64)
+    transform = np.ones(points + 1, dtype=np.complex128)
     for freedom, count in zip(*np.unique(np.minimum(freedoms, 1e6), return_counts=True), strict=True):
         # The mean excess over each point; its second differences are the masses that keep the mean.
         below = freedom / (at + freedom)
@@ -289,11 +285,11 @@ def _sum_tail(freedoms: tuple[float, ...], reach: float) -> tuple[Array, Array]:
         excess -= at * special.betainc(0.5 * freedom, 0.5, below)
         mass = np.diff(excess, 2, prepend=excess[0]) / step
         mass[0] += 1.0
-        transform *= np.fft.rfft(mass, 2 * GRID) ** count
-    mass = np.asarray(np.fft.irfft(transform, 2 * GRID)[:GRID], dtype=np.float64)
+        transform *= np.fft.rfft(mass, 2 * points) ** count
+    mass = np.asarray(np.fft.irfft(transform, 2 * points)[:points], dtype=np.float64)
     # Below 1e-15 a tail is rounding of the transform.
     log_tail: Array = np.log(np.maximum(1.0 - (np.cumsum(mass) - 0.5 * mass), 1e-15))
-    return at[:GRID], log_tail
+    return at[:points], log_tail
 
 
 def _correlation_errors(count: int, rows: float) -> Array:

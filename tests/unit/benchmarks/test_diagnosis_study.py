@@ -8,11 +8,17 @@ import numpy as np
 import pytest
 
 from benchmarks.diagnosis_study import judge_record, section
-from benchmarks.harness.pool import Pool
-from benchmarks.harness.tables import replace_between
+from benchmarks.harness.study import Pool, replace_between
 from benchmarks.hidden.classes import CLASSES, NEARLY, draw_record, find_class, seed_of
-from benchmarks.hidden.score import Score, Share, confusion, failures, main_table, percent, reliability_table
-from benchmarks.hidden.suspects import SuspectsJudged
+from benchmarks.hidden.score import (
+    SuspectsJudged,
+    confusion,
+    failures,
+    main_table,
+    percent,
+    reliability_table,
+    score,
+)
 from reactorwatch.errors import InputError
 from tests.hidden_effect.draw import draw
 from tests.hidden_effect.excitation import MEDIUM_NOISE
@@ -26,31 +32,25 @@ def one(truth: str, said: str, **more: object) -> Judged:
     return Judged(**(found.__dict__ | told | {"first": truth == said, "listed": truth == said, "count": 1} | more))
 
 
-def test_shares_are_shares_of_all_records() -> None:
-    score = Score.of([one("a", "a"), one("a", "b", listed=True, count=3), one("b", ""), one("b", "b")])
-    assert score.first == 0.5
-    assert score.listed == 0.75
-    assert score.count == 1.5
-    assert score.wrong == 0.25
+def test_shares_are_shares_of_all_records_and_a_diagnosis_that_failed_is_a_miss() -> None:
+    found = score([one("a", "a"), one("a", "b", listed=True, count=3), one("b", ""), one("b", "b")])
+    assert [found[name].split()[0] for name in ("first %", "listed %", "list", "wrong %")] == [
+        *("50.0", "75.0", "1.50", "25.0")
+    ]
+    found = score([one("a", "a"), one("a", "", verdict="", remark="InputError: no")])
+    assert (found["first %"].split()[0], found["errors"]) == ("50.0", "1")
 
 
 def test_a_quantile_is_a_value_that_occurred_and_what_is_no_number_counts_as_the_worst() -> None:
-    score = Score.of([one("a", "a", held_out=value) for value in (1.0, 1.1, 1.2, nan)])
-    assert score.held_out_in_sd == (1.1, np.inf)
+    assert score([one("a", "a", held_out=value) for value in (1.0, 1.1, 1.2, nan)])["/ its sd"] == "1.100 / inf"
 
 
 def test_an_error_is_compared_with_the_noise_of_its_own_rows() -> None:
     errors = ((0.9, 0.9), (1.1, 1.1), (1.02, 1.0))  # in standard deviations: of what was found, of the truth
-    score = Score.of([one("a", "a", held_out=found, drawn=drawn) for found, drawn in errors])
-    assert score.held_out == (1.0, 1.02)
-    assert score.held_out_in_sd == (1.02, 1.1)
-    assert score.drawn_in_sd == (1.0, 1.1)
-
-
-def test_a_diagnosis_that_came_to_no_end_counts_as_a_miss() -> None:
-    score = Score.of([one("a", "a"), one("a", "", verdict="", remark="InputError: no")])
-    assert score.first == 0.5
-    assert score.errors == 1
+    found = score([one("a", "a", held_out=error, drawn=drawn) for error, drawn in errors])
+    assert [found[name] for name in ("held-out T / noise drawn", "/ its sd", "the truth's")] == [
+        *("1.000 / 1.020", "1.020 / 1.100", "1.000 / 1.100")
+    ]
 
 
 def test_the_confusion_table_counts_what_each_truth_was_called() -> None:
@@ -59,9 +59,10 @@ def test_the_confusion_table_counts_what_each_truth_was_called() -> None:
 
 
 def test_a_share_has_the_interval_of_its_number_of_records() -> None:
-    assert percent(Share.of([True] * 9 + [False])) == "90.0 (60–98)"
-    assert percent(Share.of([])) == "–"
-    assert Share.of([True] * 50).interval == pytest.approx((1.0 / (1.0 + 1.959964**2 / 50), 1.0))
+    """Wilson's interval of 9 in 10: 0.596 to 0.982 (Brown, Cai & DasGupta 2001, Statistical Science 16, formula 4)."""
+    assert percent([True] * 9 + [False]) == "90.0 (60–98)"
+    assert percent([]) == "–"
+    assert percent([True] * 50) == f"100.0 ({100 / (1.0 + 1.959964**2 / 50):.0f}–100)"
 
 
 def test_the_table_of_reliability_counts_what_was_right_at_each_stated_probability() -> None:

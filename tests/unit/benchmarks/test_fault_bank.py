@@ -8,6 +8,7 @@ import pytest
 from rich.console import Console
 from scipy import stats
 
+from benchmarks.faults.__main__ import print_fault_free, print_summary, print_table, quantiles
 from benchmarks.faults.detectors import (
     METHODS,
     TRAINING_ROWS,
@@ -23,20 +24,21 @@ from benchmarks.faults.detectors import (
     outcome_of,
     suspicion,
 )
-from benchmarks.faults.oracle import CAUSES, log_likelihood_ratio, oracle_delay_min, oracle_suspect
 from benchmarks.faults.study import (
+    CAUSES,
     MONITOR,
     ORACLE,
     CaseResult,
     FaultFreeResult,
-    Rate,
     Widths,
     detectors,
+    log_likelihood_ratio,
+    oracle_delay_min,
+    oracle_suspect,
     rows_to_false_alarm,
     run_case,
     run_fault_free,
 )
-from benchmarks.faults.tables import print_fault_free, print_summary, print_table, quantiles
 from benchmarks.harness.bank import (
     AFTER_MIN,
     BANK,
@@ -277,13 +279,6 @@ def test_the_first_alarm_after_the_onset_that_none_stood_before_is_the_detection
 def test_what_is_not_detected_counts_as_endless_in_the_quantiles() -> None:
     assert quantiles([1.0, 3.0, inf, 2.0]) == (2.0, inf)
     assert quantiles([inf, inf, 1.0, inf]) == (inf, inf)
-
-
-@pytest.mark.parametrize(("count", "lower", "upper"), [(0, 0.0, 3.689), (3, 0.6187, 8.767), (10, 4.795, 18.39)])
-def test_intervals_of_a_rate_are_the_published_ones_of_a_poisson_count(count: int, lower: float, upper: float) -> None:
-    """Pearson & Hartley, Biometrika Tables for Statisticians I, table 40, two-sided 95 %."""
-    rate = Rate(count, watched_min=30 * 24 * 60)
-    assert rate.interval_per_30_days == pytest.approx((lower, upper), rel=1e-3)
 
 
 def alarm(event: str, minute: float, name: str = "ewma/T", incident: int = 1) -> Alarm:

@@ -16,14 +16,6 @@ def test_strange_messages_are_counted_one_by_one_and_raise_no_alarm() -> None:
     assert {"payload", "encoding", "unknown_signal", "out_of_place", "out_of_range", "too_large"} <= found.keys()
 
 
-def test_runs_of_bad_values_end_no_watch_and_touch_no_other_plant() -> None:
-    """With isolation on, in a fleet, and with a monitor that is started again and reads the same samples again."""
-    found = fuzz.fuzz_values(60, seed=15)
-    assert found["bad values"] >= 60
-    assert found["restarts"] >= 3
-    assert found["changes of alarms"] > 0
-
-
 def test_strange_commands_are_answered_in_one_line() -> None:
     found = fuzz.fuzz_commands(1000, seed=12)
     assert found["refused"] + found["accepted"] == 2000

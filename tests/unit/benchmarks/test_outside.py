@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy import linalg, stats
 from sklearn.covariance import EmpiricalCovariance  # type: ignore[import-untyped]
 
-from benchmarks.outside.peers import LAGS, WINDOW, CanonicalVariates, DynamicPca, Pca, cross_validated_limits, stack
+from benchmarks.outside.peers import LAGS, WINDOW, CanonicalVariates, DynamicPca, Pca, cross_validated_limits
 from benchmarks.outside.scores import Row, blocks_of, bootstrap_interval, compare_rows, markdown, score_change_points
 
 Array = NDArray[np.float64]
@@ -92,10 +92,6 @@ def test_cross_validated_limits_are_quantiles_of_blocks_judged_by_the_others() -
         values.append(Pca.fit(np.delete(rows, part, axis=0)).statistics(rows[part])["T2"])
     limit = cross_validated_limits(Pca, rows, 0.9, blocks=4)["T2"]
     assert limit == pytest.approx(np.quantile(np.concatenate(values), 0.9))
-
-
-def test_stack_puts_the_rows_before_behind_each_row() -> None:
-    np.testing.assert_array_equal(stack(np.array([[1.0], [2.0], [3.0]]), 1)[1:], [[2.0, 1.0], [3.0, 2.0]])
 
 
 def test_rows_are_counted_over_all_files_together() -> None:

@@ -10,8 +10,7 @@ import pytest
 
 from benchmarks.harness import plants
 from benchmarks.harness.plants import FLOWS, INPUTS, KINDS, Kind, simulate
-from benchmarks.harness.pool import Pool
-from benchmarks.harness.tables import median_interval, poisson_interval, share_interval
+from benchmarks.harness.study import Pool, median_interval, poisson_interval, share_interval
 from benchmarks.promise import black_box
 from benchmarks.promise.not_quite import Outcome, Plant, print_counts, print_delays
 from plant_node.record import simulate_record

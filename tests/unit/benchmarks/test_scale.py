@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks import scale
-from benchmarks.harness.traffic import LEARNED_ROWS, plant_name
+from benchmarks.scale import LEARNED_ROWS, plant_name
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from reactorwatch.contract.codec import Encoded, encode

@@ -160,7 +160,7 @@ def test_python_finds_the_same_alarms_with_the_process_that_the_record_was_read_
         (item["alarm"], item["raised_min"]) for item in expected["alarms"]
     ]
     assert found.trained_until_min == expected["trained_until_min"]
-    assert found.signals == expected["signals"]
+    assert found.to_dict()["signals"] == expected["signals"]
 
 
 def test_an_input_that_never_moves_is_named() -> None:

@@ -19,7 +19,7 @@ from reactorwatch.cli.processes import Processes
 from reactorwatch.errors import InputError
 from reactorwatch.runtime import bus_zenoh
 from reactorwatch.runtime.event_loop import StopSignal
-from reactorwatch.runtime.security.provisioning import make_site
+from reactorwatch.runtime.provisioning import make_site
 from tests.unit.cli.test_crash import files as files
 from tests.unit.cli.test_crash import folder as folder
 from tests.unit.cli.test_crash import run

@@ -21,7 +21,7 @@ from reactorwatch.contract.codec import Publication, encode
 from reactorwatch.contract.messages_pb2 import QUALITY_GOOD, Sample
 from reactorwatch.errors import InputError
 from reactorwatch.records.write import write_table
-from reactorwatch.runtime import crash
+from reactorwatch.runtime import node_main as crash
 from reactorwatch.runtime.config import read_settings
 from recorder import RecordedMessage
 from recorder.config import RecorderConfig
@@ -225,7 +225,7 @@ def test_a_recording_of_a_plant_with_an_impossible_name_is_watched_under_no_name
     "fails",
     [
         "reactorwatch.diagnosis.report.page.as_page",
-        "reactorwatch.cli.diagnose.report_object",
+        "reactorwatch.api.diagnosis.DiagnosisResult.to_dict",
         "reactorwatch.cli.diagnose.write_extended_model",
         "reactorwatch.cli.diagnose.write_drawing",
     ],

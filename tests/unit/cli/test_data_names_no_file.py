@@ -14,12 +14,12 @@ from reactorwatch.cli.processes import Processes
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Publication, encode
 from reactorwatch.contract.messages_pb2 import QUALITY_GOOD, Health, Sample
-from reactorwatch.description.find import find_in_catalogue, find_process
+from reactorwatch.description.read import find_in_catalogue, find_process
 from reactorwatch.errors import InputError
 from reactorwatch.process.extended_model import FORMAT, ExtendedModel
 from recorder import RecordedMessage
 from recorder.config import ReplayConfig
-from recorder.files.metadata import PROCESS
+from recorder.files.recording import PROCESS
 from recorder.files.writer import RecordingWriter
 from recorder.tools.replay import open_tape
 

@@ -14,8 +14,8 @@ from typer.testing import CliRunner, Result
 from reactorwatch.api.diagnosis import Case
 from reactorwatch.cli.main import app
 from reactorwatch.cli.processes import Processes
-from reactorwatch.description.find import find_process
 from reactorwatch.description.process import Process, describe_model
+from reactorwatch.description.read import find_process
 from reactorwatch.errors import InputError
 from reactorwatch.process.library.cascaded_tanks import tanks
 from reactorwatch.process.model import ProcessModel

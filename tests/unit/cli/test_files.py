@@ -17,7 +17,6 @@ from monitor_node.replay.backtest import run as watch
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from plant_node.scenario import HeldRecord
-from reactorwatch.api.backtest_report import backtest_object, backtest_text
 from reactorwatch.api.simulation import report, simulate_along
 from reactorwatch.cli import identify
 from reactorwatch.cli.batch import as_table, expand_files
@@ -28,7 +27,9 @@ from reactorwatch.identification.identify import ModelForm
 from reactorwatch.process.library.cstr import cstr
 from reactorwatch.records.record import Record, join_runs
 from reactorwatch.records.write import check_folder_name
-from recorder.files.metadata import FILE_INDEX
+from reactorwatch.sentences.backtest import backtest_text
+from reactorwatch.sentences.models import simulation_text
+from recorder.files.recording import FILE_INDEX
 from recorder.files.writer import RecordingWriter
 from recorder.tools.convert import import_csv
 from recorder.tools.player import samples_of
@@ -105,8 +106,9 @@ def test_each_run_is_simulated_from_its_own_first_row(whole: Record, tmp_path: P
     assert np.array_equal(simulated.columns["T"], join_runs(alone).columns["T"])
     assert np.array_equal(simulated.time_min, record.time_min)
     assert simulated.runs is not None
-    assert json.loads(report(record, simulated, cstr(), tmp_path, as_json=True))["runs"] == 2
-    assert "2 runs" in report(record, simulated, cstr(), tmp_path, as_json=False)
+    compared = report(record, simulated, cstr(), tmp_path)
+    assert compared.to_dict()["runs"] == 2
+    assert "2 runs" in simulation_text(compared)
 
 
 def test_a_run_of_one_row_is_simulated_as_that_row(whole: Record) -> None:
@@ -148,10 +150,9 @@ def test_a_back_test_raises_the_same_alarms_after_the_clock_was_set_back(whole: 
     ]
     assert raised[: len(raised) // 2] == raised[len(raised) // 2 :]
     assert len(raised) >= 4
-    said = backtest_object(back, 0)
-    assert (said["samples"], said["runs"], said["zero"]) == (ROWS, 2, None)
-    assert said["span_min"] == pytest.approx(159.8)
-    assert "2 runs" in backtest_text(back, 0, Path("run.csv"))
+    assert (back.samples, back.runs, back.zero) == (ROWS, 2, None)
+    assert back.span_min == pytest.approx(159.8)
+    assert "2 runs" in backtest_text(back)
 
 
 def test_several_runs_drive_no_plant(whole: Record) -> None:

@@ -92,7 +92,7 @@ def test_another_file_validates_and_settled_rows_are_left_out() -> None:
     record, other = rw.read_record("rig.csv", process), rw.read_record("other.csv", process)
     model = rw.identify(record, "th", process=process, validate=other, settle=50, order=2)
     assert [*model.a] == found["a"]
-    assert model.rmse.free_run == found["rmse"]["free_run"]  # type: ignore[union-attr]
+    assert model.rmse.free_run == found["rmse"]["free_run"]
 
 
 def test_a_catalogue_process_is_identified_by_name(folder: Path) -> None:

@@ -241,17 +241,17 @@ def register(*function, **options):
 numba.njit = register
 from monitor_node.config import MonitorConfig
 from monitor_node.causes.stage import preparation
-from reactorwatch.runtime import logs
+from reactorwatch.runtime.node_main import configure_log
 from reactorwatch.cli import kernels as compilation
 from reactorwatch.process.library.cstr import cstr
-from reactorwatch.codegen.cache import CodeCache
+from reactorwatch.codegen.compiled_function import CodeCache
 
 made, keep = [], CodeCache._store
 CodeCache._store = lambda self, path, code: made.append(path.name)
 parts = sum(1 for _ in preparation(MonitorConfig(), cstr()))
 CodeCache._store = keep
 print(parts, len(made))
-logs.configure()  # on standard error
+configure_log()  # on standard error
 compilation.FAULT = "feed_temperature:step:3@40min"
 compilation.compile_kernels()
 print(sum(sum(kernel.stats.cache_hits.values()) for kernel in kernels))

@@ -10,7 +10,7 @@ from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from reactorwatch.cli import identify
 from reactorwatch.cli.linearise import describe
-from reactorwatch.description.find import find_process
+from reactorwatch.description.read import find_process
 from reactorwatch.errors import InputError
 from reactorwatch.identification.identify import ModelForm
 from reactorwatch.process.library.cstr import cstr

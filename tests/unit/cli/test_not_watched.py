@@ -237,8 +237,7 @@ def main(monkeypatch: pytest.MonkeyPatch) -> Typed:
     return run
 
 
-@pytest.mark.parametrize("kind", ["csv", "mcap"])
-@pytest.mark.parametrize("signal", ["qc", "C", "T"])
+@pytest.mark.parametrize(("signal", "kind"), [("T", "csv"), ("qc", "mcap")])
 def test_backtest_names_the_signal_that_has_no_value_and_watches_the_others(
     signal: str,
     kind: str,
@@ -271,8 +270,10 @@ def test_backtest_without_any_output_is_refused_with_the_file(
     assert "Traceback" not in told
 
 
-@pytest.mark.parametrize("options", [[], ["--compare"], ["--model", "oe"]])
-@pytest.mark.parametrize(("record", "signal", "output"), [("no_T", "T", "T"), ("no_C", "C", "C"), ("no_qc", "qc", "T")])
+@pytest.mark.parametrize(
+    ("record", "signal", "output", "options"),
+    [("no_T", "T", "T", []), ("no_C", "C", "C", ["--compare"]), ("no_qc", "qc", "T", ["--model", "oe"])],
+)
 def test_identify_names_the_signal_that_has_no_value_and_the_file(
     record: str,
     signal: str,

@@ -17,6 +17,7 @@ from reactorwatch.errors import InputError
 from reactorwatch.process.library.three_tanks import three_tanks
 from reactorwatch.process.model import fingerprint
 from reactorwatch.records.file_format import FileFormat
+from reactorwatch.records.record import format_utc
 from recorder.files.recording import Recording
 from recorder.tools.convert import export_csv, import_csv, read_record
 from tests.unit.process.test_three_tanks import measure
@@ -201,7 +202,7 @@ def test_clock_time_goes_into_recordings_messages_and_exports(local: Path, tmp_p
     recorded = read_record(tmp_path / "a.mcap")
     assert recorded.zero == ZERO
     assert (np.diff(recorded.time_min) == 1.0).all()
-    assert open_messages(local, stated=BERLIN).zero(0) == ZERO
+    assert format_utc(open_messages(local, stated=BERLIN).zero_ns or 0) == ZERO
     export_csv(tmp_path / "a.mcap", tmp_path / "a.csv", clock=True)
     header, first, *_ = (tmp_path / "a.csv").read_text().splitlines()
     assert header == "time_min,qc,C,T,time"

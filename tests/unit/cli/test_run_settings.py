@@ -22,8 +22,8 @@ from reactorwatch.cli.my_plant import describe_in_file
 from reactorwatch.cli.option_groups import BusOptions
 from reactorwatch.cli.plant_settings import PlayedRecord, load_source
 from reactorwatch.cli.up import diagnosis_settings
-from reactorwatch.description.find import ProcessChoice, find_process
 from reactorwatch.description.process import Process, Signal
+from reactorwatch.description.read import ProcessChoice, find_process
 from reactorwatch.errors import InputError
 from reactorwatch.process import MODELS
 from reactorwatch.records.file_format import FileFormat

@@ -17,7 +17,7 @@ from reactorwatch.contract.messages_pb2 import (
     Sample,
     Suspect,
 )
-from reactorwatch.description.find import find_process
+from reactorwatch.description.read import find_process
 
 S = 10**9
 START_NS = 1_000 * S
@@ -198,7 +198,7 @@ def test_the_json_has_both_in_the_words_of_a_back_test() -> None:
     assert (plant["promise"]["kept"], plant["promise"]["can_keep_per_30_days"]) == (False, 40.0)
     step, ramp = plant["power"]
     sizes = {"within_10_min": 0.0114, "within_1_h": 0.00512, "within_1_day": 0.003}
-    assert step == {"deviation": "coolant_flow", "unit": "1", **sizes}
+    assert step.to_dict() == {"deviation": "coolant_flow", "unit": "1", **sizes}
     assert (ramp["profile"], ramp["within_10_min"]) == ("ramp", None)
 
 

@@ -15,14 +15,14 @@ from reactorwatch.api.files import open_messages, record
 from reactorwatch.api.simulation import simulate_along
 from reactorwatch.cli.backtest import BacktestOptions, run_job
 from reactorwatch.cli.batch import make_jobs
+from reactorwatch.cli.diagnose import write_extended_model
 from reactorwatch.cli.options import parse_span_ns
 from reactorwatch.cli.recordings import cut
-from reactorwatch.description.find import ProcessChoice
+from reactorwatch.description.read import ProcessChoice
 from reactorwatch.diagnosis.diagnose import diagnose
 from reactorwatch.process.library.cstr import cstr
 from reactorwatch.records.record import Record
 from reactorwatch.records.write import write_table
-from reactorwatch.runtime.model_file import write_extended_model
 from recorder.columns import read_run
 from recorder.tools.convert import import_csv, read_record
 from recorder.tools.inspect import inspect

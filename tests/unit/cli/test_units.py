@@ -11,27 +11,28 @@ from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 from monitor_node.config import MonitorConfig
-from monitor_node.replay.backtest import Backtest, run
+from monitor_node.replay.backtest import run
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from reactorwatch.api.files import open_messages
 from reactorwatch.cli import backtest, identify
 from reactorwatch.cli.backtest import choose_settings
 from reactorwatch.cli.batch import Job
+from reactorwatch.cli.diagnose import write_extended_model
 from reactorwatch.cli.main import app
-from reactorwatch.description.find import DEFAULT_CHOICE, ProcessChoice
-from reactorwatch.diagnosis.units import find_wrong_unit
+from reactorwatch.description.read import DEFAULT_CHOICE, ProcessChoice
+from reactorwatch.diagnosis.record_checks import find_wrong_unit
 from reactorwatch.errors import InputError
 from reactorwatch.identification.identify import ModelForm
 from reactorwatch.process import MODELS
 from reactorwatch.process.library.cstr import cstr
 from reactorwatch.records.record import Record
 from reactorwatch.records.write import write_table
-from reactorwatch.runtime.model_file import write_extended_model
+from reactorwatch.results.backtest import Backtest
 from reactorwatch.spc.charts.base import format_quantity
-from recorder.columns import find_model, read_run, signal_title
+from recorder.columns import read_run
 from recorder.files.recording import Recording
-from recorder.panels.signals import OVERVIEW
+from recorder.panels.signals import OVERVIEW, find_model, signal_title
 from recorder.tools.convert import import_csv, read_record
 from recorder.tools.player import samples_of
 from tests.tables import UNITS, read_csv

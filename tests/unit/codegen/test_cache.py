@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from reactorwatch.codegen.cache import CodeCache
+from reactorwatch.codegen.compiled_function import CodeCache
 
 
 class Maker:

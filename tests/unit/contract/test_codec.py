@@ -1,4 +1,7 @@
-"""The contract: messages decode as they were encoded, foreign ones are refused, and yesterday's bytes still read."""
+"""The contract: messages decode as they were encoded, foreign ones are refused, and yesterday's bytes still read.
+
+Key expressions match as in Zenoh.
+"""
 
 import re
 import subprocess
@@ -21,6 +24,7 @@ from reactorwatch.contract.codec import (
     encoding_of,
     message_type,
 )
+from reactorwatch.contract.keys import matches
 
 FOLDER = Path(reactorwatch.contract.__file__).parent
 
@@ -155,3 +159,28 @@ def test_a_payload_of_ten_megabytes_is_not_read() -> None:
     with pytest.raises(DecodeError, match="a payload must have at most 1048576 bytes, got 100000") as refused:
         decode(sample.SerializeToString(), encoding_of(messages.Sample))
     assert refused.value.reason == "too_large"
+
+
+@pytest.mark.parametrize(
+    ("expression", "key", "expected"),
+    [
+        ("a/b", "a/b", True),
+        ("a/*", "a/b", True),
+        ("a/*", "a/b/c", False),
+        ("a/**", "a/b/c", True),
+        ("a/**", "a", True),
+        ("**", "a/b", True),
+        ("a/**/c", "a/c", True),
+        ("a/**/c", "a/b/b/c", True),
+        ("a/**/c", "a/b", False),
+        ("a/b*", "a/bc", True),
+        ("a.b/c", "aXb/c", False),
+    ],
+)
+def test_key_expressions_match_as_in_zenoh(expression: str, key: str, expected: bool) -> None:
+    """https://zenoh.io/docs/manual/abstractions/#key-expression."""
+    import zenoh
+
+    assert matches(expression, key) is expected
+    if "b*" not in expression:  # Zenoh writes a part of a part as $*
+        assert zenoh.KeyExpr(expression).intersects(zenoh.KeyExpr(key)) is expected

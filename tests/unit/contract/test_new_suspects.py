@@ -1,7 +1,7 @@
 """Suspects of an incident count as new once; the incidents published last are remembered."""
 
-from reactorwatch.contract.alarm_text import MAX_INCIDENTS, NewSuspects
 from reactorwatch.contract.messages_pb2 import Suspect
+from reactorwatch.contract.suspects import MAX_INCIDENTS, NewSuspects
 
 LEAK, FOULING = [Suspect(cause="leak", probability=0.9)], [Suspect(cause="fouling", probability=0.9)]
 

@@ -10,7 +10,7 @@ import yaml
 
 from reactorwatch.contract import keys, messages_pb2
 from reactorwatch.contract.codec import Publication
-from reactorwatch.runtime.metrics import Metrics
+from reactorwatch.runtime.http_pages import Metrics
 
 DEPLOY = Path(__file__).parents[3] / "deploy"
 MESSAGES = {

@@ -6,8 +6,8 @@ from typing import Any
 import casadi as ca
 import pytest
 
-from reactorwatch.description.find import find_process
 from reactorwatch.description.process import KnownParameter, Process, Signal, describe_model
+from reactorwatch.description.read import find_process
 from reactorwatch.errors import InputError
 from reactorwatch.process import EFFECTS_OF
 from reactorwatch.process.effect import Effect, ParameterShift

@@ -1,17 +1,19 @@
 """Diagnoses constructed by hand, for tests of reports and drawings."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 from math import nan
 
 import numpy as np
+from msgspec.structs import replace
 
 from reactorwatch.arrays import Array
 from reactorwatch.diagnosis.difference import compute_difference
 from reactorwatch.diagnosis.result import (
+    Adequacy,
     AdjustedParameter,
     Alternative,
     Cause,
+    Correlation,
     Curves,
     Diagnosis,
     Estimate,
@@ -21,6 +23,7 @@ from reactorwatch.diagnosis.result import (
     HeldOut,
     Law,
     LawCurve,
+    LocationEvidence,
     RivalLaw,
     Separation,
 )
@@ -29,25 +32,29 @@ from reactorwatch.process.law import ExtendedLaw
 ROWS = 2000
 
 LEAK = Cause(
-    "coolant_flow",
-    "step",
-    "coolant leak",
-    "coolant",
-    {"size": Estimate(-0.0499634, 8.5e-5, "1"), "onset": Estimate(150.3349, 0.0122, "min")},
+    cause="coolant_flow",
+    profile="step",
+    label="coolant leak",
+    location="coolant",
+    parameters={"size": Estimate(-0.0499634, 8.5e-5, "1"), "onset": Estimate(150.3349, 0.0122, "min")},
 )
 DRIFT = Cause(
-    "temperature_bias",
-    "ramp",
-    "drift of the temperature sensor",
-    "temperature_sensor",
-    {"size": Estimate(2.5, 0.1, "K"), "onset": Estimate(20.0, 3.0, "min"), "end": Estimate(199.9, 0.0, "min")},
+    cause="temperature_bias",
+    profile="ramp",
+    label="drift of the temperature sensor",
+    location="temperature_sensor",
+    parameters={
+        "size": Estimate(2.5, 0.1, "K"),
+        "onset": Estimate(20.0, 3.0, "min"),
+        "end": Estimate(199.9, 0.0, "min"),
+    },
 )
 CURVE = Cause(
-    "feed_temperature",
-    "free",
-    "wrong feed temperature",
-    "feed",
-    {
+    cause="feed_temperature",
+    profile="free",
+    label="wrong feed temperature",
+    location="feed",
+    parameters={
         "size": Estimate(3.0, 0.2, "K"),
         "time_1": Estimate(0.0, 0.0, "min"),
         "time_2": Estimate(199.9, 0.0, "min"),
@@ -128,21 +135,27 @@ def diagnosis_of(
         for (name, run), item in zip(drawn.simulated_before.items(), held_out.values(), strict=True)
     }
     return Diagnosis(
+        file="run.csv",
+        zero=None,
         samples=ROWS,
+        runs=1,
         span_min=199.9,
+        seconds=1.25,
         verdict=verdict,
         causes=causes,
         alternatives=alternatives,
-        location=location or (causes[0].location if causes else ""),
+        location=location or (causes[0].location if causes else None),
+        locations=(),
+        law=None,
         significant=verdict != "nominal",
         practical=practical and verdict != "nominal",
-        differences=differences,
         gain=Gain(209025.5 if causes else 0.0, held_out),
-        adequacy={"C": 0.3, "T": 0.35},
+        adequacy={"C": Adequacy(0.3), "T": Adequacy(0.35)},
         experiment=experiment,
         extended_model={"format": "reactorwatch.model.v1", "model": "cstr", "effects": []},
-        remarks=remarks,
         parameters=parameters or {},
+        differences=differences,
+        remarks=remarks,
         curves=drawn,
     )
 
@@ -150,11 +163,11 @@ def diagnosis_of(
 FEED = Alternative(
     (
         Cause(
-            "feed_temperature",
-            "step",
-            "wrong feed temperature",
-            "feed",
-            {"size": Estimate(1.234, 0.05, "K"), "onset": Estimate(150.1, 0.4, "min")},
+            cause="feed_temperature",
+            profile="step",
+            label="wrong feed temperature",
+            location="feed",
+            parameters={"size": Estimate(1.234, 0.05, "K"), "onset": Estimate(150.1, 0.4, "min")},
         ),
     ),
     3.21,
@@ -168,7 +181,7 @@ CASES = {
     "unknown": diagnosis_of("unknown", location="energy_balance"),
     "law": replace(
         diagnosis_of("unknown", location="energy_balance"),
-        locations={"energy_balance": 0.0, "coolant": 4.5},
+        locations=(LocationEvidence("energy_balance", 0.0), LocationEvidence("coolant", 4.5)),
         law=Law(
             location="energy_balance",
             form="power",
@@ -180,7 +193,7 @@ CASES = {
             rivals=(RivalLaw("coolant", "linear", "a + b (qc - 100)", 4.5),),
             range={"T": (425.0, 452.0)},
             held_out={"T": HeldOut(0.98, 0.301, 0.31, 0.3, 0.3, "K")},
-            correlations={"a": ("Tf", 0.97)},
+            correlations={"a": Correlation("Tf", 0.97)},
             extended=ExtendedLaw(
                 "energy balance", "power", ("T",), (440.0,), {"a": -0.88, "n": 4.1}, {"T": (425.0, 452.0)}
             ),
@@ -191,8 +204,8 @@ CASES = {
     ),
 }
 ROUGHLY = {
-    "K3": AdjustedParameter(700.0, 14.0, Estimate(711.2, 1.5, "l/min")),
-    "Tf": AdjustedParameter(350.0, 0.5, Estimate(350.0, 0.1, "K")),
+    "K3": AdjustedParameter(700.0, 14.0, 711.2, 1.5, "l/min"),
+    "Tf": AdjustedParameter(350.0, 0.5, 350.0, 0.1, "K"),
 }
 ADJUSTED = diagnosis_of("nominal", parameters=ROUGHLY)
 """Where parameters were stated to be uncertain."""

@@ -14,6 +14,7 @@ from reactorwatch.diagnosis.run import Run
 from reactorwatch.diagnosis.search.search import FittedHypothesis
 from reactorwatch.process.effect import Effect, ParameterEffect, ParameterShift
 from reactorwatch.process.model import Output, ProcessModel, new_clock, parameter, variable
+from reactorwatch.records.record import Record
 
 RATE, PERIOD_MIN, NOISE_SD = 0.5, 0.1, 0.2
 """1/min, min, and m."""
@@ -64,3 +65,12 @@ def follows(u: Array, start: float) -> Array:
     for held in u[:-1].tolist():
         h.append(kept * h[-1] + (1.0 - kept) * held)
     return np.array(h)
+
+
+LEVELS = np.repeat([4.0, 7.0, 3.0, 6.0, 2.0, 8.0, 5.0, 4.0, 6.0, 3.0], 60)
+
+
+def tank_record(noise_sd: float = NOISE_SD, gain: float = 1.0) -> Record:
+    """Record of a tank whose input has another gain."""
+    level = follows(gain * LEVELS, gain * LEVELS[0]) + noise_sd * np.random.default_rng(1).standard_normal(LEVELS.size)
+    return Record(PERIOD_MIN * np.arange(LEVELS.size, dtype=np.float64), {"u": LEVELS, "h": level}, "tank")

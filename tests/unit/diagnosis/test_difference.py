@@ -5,7 +5,7 @@ import pytest
 
 from reactorwatch.arrays import Array
 from reactorwatch.diagnosis.difference import BINS, TIME, Difference, compute_difference
-from reactorwatch.diagnosis.report.words import describe_difference
+from reactorwatch.sentences.diagnosis import describe_difference
 
 ROWS, NOISE = 8000, 0.3
 T_MIN: Array = np.linspace(0.0, 800.0, ROWS)

@@ -1,23 +1,28 @@
-"""The page of a diagnosis: self-contained, well-formed, and its pictures hide no peak."""
+"""The page of a diagnosis: self-contained, well-formed, its curves first."""
 
+import hashlib
 import re
 import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
 from functools import cache
 from html.parser import HTMLParser
+from pathlib import Path
 
 import casadi as ca
 import numpy as np
 import pytest
+from msgspec import structs
 
+from reactorwatch.api.shown import report_origin
 from reactorwatch.diagnosis.report import mathml
 from reactorwatch.diagnosis.report.equations import balances
 from reactorwatch.diagnosis.report.page import as_page
-from reactorwatch.diagnosis.report.svg import COLUMNS, decimate
 from reactorwatch.diagnosis.result import UnknownInputCurve
+from reactorwatch.figures import Line, Panel, panel_svg
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.library.cstr import EFFECTS, cstr
 from reactorwatch.process.model import ProcessModel
+from reactorwatch.version import this_build
 from tests.unit.diagnosis.cases import ADJUSTED, CASES
 
 EMPTY = {"meta", "br", "hr", "img", "link", "input"}
@@ -113,16 +118,19 @@ def test_an_ambiguous_verdict_shows_all_rivals_with_their_sizes_and_the_experime
 
 
 def test_an_ambiguous_verdict_without_an_experiment_states_it() -> None:
-    text = as_page(replace(CASES["ambiguous"], experiment=None), cstr(), EFFECTS, "a.csv", "extended.json")
+    text = as_page(structs.replace(CASES["ambiguous"], experiment=None), cstr(), EFFECTS, "a.csv", "extended.json")
     assert "No experiment within the limits separates them." in text.partition("<h2>")[0]
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_the_described_colours_hold_on_a_dark_ground_too_and_plots_are_as_wide_as_the_page(case: str) -> None:
-    text = page(case)
-    assert "dark" not in text.partition("</style>")[2]
-    assert "min-width" not in text
-    assert "figure > svg { display: block; width: 100%;" in text
+def test_curves_come_before_tables_which_are_folded(case: str) -> None:
+    body = page(case).partition("</style>")[2].partition('<div class="facts')[2].partition("</div>\n\n")[2]
+    shown, _, folded = body.partition("<details>")
+    assert shown.count("<figure>") >= 4
+    assert "<table" not in shown
+    assert "<figure>" not in folded
+    assert "dark" not in body, "colours are the style sheet's"
+    assert "min-width" not in page(case)
 
 
 def test_something_unknown_is_drawn_over_time_as_what_would_do_the_same() -> None:
@@ -132,7 +140,7 @@ def test_something_unknown_is_drawn_over_time_as_what_would_do_the_same() -> Non
     told = replace(
         curves, unknown=UnknownInputCurve("heat loss", "1/min", np.linspace(0.0, 0.01, curves.time_min.size))
     )
-    text = as_page(replace(CASES["unknown"], curves=told), cstr(), EFFECTS, "a.csv", "extended.json")
+    text = as_page(structs.replace(CASES["unknown"], curves=told), cstr(), EFFECTS, "a.csv", "extended.json")
     assert "Size of the unknown effect" in text
     assert "Estimated as the size of: heat loss, 1/min" in text
 
@@ -150,7 +158,7 @@ def test_the_page_lists_the_posterior_of_uncertain_parameters() -> None:
 
 def test_a_page_without_curves_is_refused() -> None:
     with pytest.raises(ValueError, match="without its curves"):
-        as_page(replace(CASES["named"], curves=None), cstr(), EFFECTS, "a.csv", "extended.json")
+        as_page(structs.replace(CASES["named"], curves=None), cstr(), EFFECTS, "a.csv", "extended.json")
 
 
 def test_a_free_run_that_ran_away_and_a_size_of_unknown_spread_are_drawn_as_far_as_they_go() -> None:
@@ -165,7 +173,7 @@ def test_a_free_run_that_ran_away_and_a_size_of_unknown_spread_are_drawn_as_far_
         replace(curves, residual_before={"C": nothing, "T": nothing}),
         replace(curves, measured={"C": nothing, "T": curves.measured["T"]}),
     ):
-        text = as_page(replace(CASES["named"], curves=broken), cstr(), EFFECTS, "a.csv", "extended.json")
+        text = as_page(structs.replace(CASES["named"], curves=broken), cstr(), EFFECTS, "a.csv", "extended.json")
         drawn = re.findall(r'\b(?:d|points)="([^"]*)"', text)
         assert not [part for part in drawn if "nan" in part or "inf" in part]
 
@@ -173,36 +181,10 @@ def test_a_free_run_that_ran_away_and_a_size_of_unknown_spread_are_drawn_as_far_
 def test_a_page_of_many_rows_stays_small() -> None:
     curves = CASES["named"].curves
     assert curves is not None
-    assert len(page("named")) < 600_000
-    long = np.linspace(0.0, 750.0, 7500)
-    assert decimate(long, np.sin(long))[0].size <= 2 * (COLUMNS + 1)
-
-
-def test_no_peak_is_lost_where_rows_outnumber_columns() -> None:
-    random = np.random.default_rng(3)
-    time_min = np.cumsum(random.uniform(0.05, 0.2, 20_000))
-    values = random.standard_normal(time_min.size)
-    values[random.integers(0, time_min.size, 500)] = np.nan
-    times, kept = decimate(time_min, values, 50)
-    column = np.floor((time_min - time_min[0]) / (time_min[-1] - time_min[0]) * 50)
-    column_kept = np.floor((times - time_min[0]) / (time_min[-1] - time_min[0]) * 50)
-    for number in np.unique(column):
-        there = values[column == number]
-        drawn = kept[column_kept == number]
-        assert np.nanmax(drawn) == np.nanmax(there)
-        assert np.nanmin(drawn) == np.nanmin(there)
-        assert drawn.size <= 2
-    assert np.all(np.diff(times) > 0)
-    assert np.all(np.isin(kept[np.isfinite(kept)], values))
-
-
-def test_a_column_without_values_is_a_gap() -> None:
-    time_min = np.arange(10_000.0)
-    values = np.ones(time_min.size)
-    values[4000:6000] = np.nan
-    times, kept = decimate(time_min, values, 100)
-    assert np.all(np.isnan(kept[(times > 4100) & (times < 5900)]))
-    assert np.all(np.isfinite(kept[(times < 3900) | (times > 6100)]))
+    times = np.linspace(0.0, 7500.0, 75_000)
+    panel = Panel("T, K", (Line("measured", times, np.sin(times)),))
+    assert len(panel_svg(panel)) < 30_000
+    assert len(page("named")) < 300_000
 
 
 @pytest.mark.parametrize("effect", EFFECTS, ids=[effect.name for effect in EFFECTS])
@@ -258,6 +240,17 @@ def test_brackets_stand_where_they_are_needed(expression: object, expected: str)
     assert "".join(root.itertext()) == expected
 
 
+def test_a_page_can_wrap_an_equation_between_the_terms_of_its_sum() -> None:
+    x, y, m = (ca.SX.sym(name) for name in ("x", "y", "m"))
+    before = -x + (x - y) * x
+    text = mathml.to_mathml(before - m * x, before, m)
+    parts = mathml.wrappable(text)
+    assert ["".join(ElementTree.fromstring(f"<math>{part}</math>").itertext()) for part in parts] == [
+        *("(x−y)x", "−x", "−mx")
+    ]
+    assert marked(parts[-1]) == ["−mx"]
+
+
 def test_what_is_long_or_has_no_sign_is_not_written_out() -> None:
     x = ca.SX.sym("x")
     long = x
@@ -291,3 +284,22 @@ def test_a_change_that_is_too_long_is_named_beside_what_was_there() -> None:
     assert changed[0].right.startswith(nominal[0].right)
     assert "changed as said above" in changed[0].right
     assert changed[1] == nominal[1]
+
+
+def test_the_origin_has_time_version_hash_of_the_file_and_chosen_settings(tmp_path: Path) -> None:
+    file = tmp_path / "a.csv"
+    file.write_bytes(b"time_min,qc\n")
+    origin = report_origin(file, {"process": "cstr", "plant": None, "tolerance": {"T": 0.5}})
+    assert origin["software"] == f"reactorwatch {this_build()}"
+    assert origin["SHA-256 of the file"] == hashlib.sha256(b"time_min,qc\n").hexdigest()
+    assert origin["settings"] == "process cstr, tolerance T=0.5"
+    assert origin["made"][:2] == "20"
+    assert origin["made"][-5] in "+-"
+    assert "SHA-256 of the file" not in report_origin(tmp_path, {})
+
+
+def test_the_page_shows_its_origin_as_text_if_it_is_stated() -> None:
+    arguments = (CASES["named"], cstr(), EFFECTS, "a.csv", "extended.json")
+    page = as_page(*arguments, origin={"file": "<a>.csv"})
+    assert '<tr><th>file</th><td class="any">&lt;a&gt;.csv</td></tr>' in page
+    assert "This report" not in as_page(*arguments)

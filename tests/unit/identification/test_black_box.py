@@ -8,16 +8,22 @@ import pytest
 
 from reactorwatch.arrays import Array
 from reactorwatch.errors import InputError
-from reactorwatch.identification.black_box.filter import (
+from reactorwatch.identification.black_box_filter import (
     BINS,
     FLAGS,
     BlackBoxFilter,
     constants_of,
     filter_row,
 )
-from reactorwatch.identification.black_box.fit import MOST_PARAMETERS, fit_black_box, largest_shapes, row_kinds
-from reactorwatch.identification.black_box.model import BlackBoxModel, Shape, lagged_inputs
-from reactorwatch.identification.black_box.prediction_error import NEXT, START, prediction_errors
+from reactorwatch.identification.black_box_fit import MOST_PARAMETERS, fit_black_box, largest_shapes, row_kinds
+from reactorwatch.identification.black_box_model import (
+    NEXT,
+    START,
+    BlackBoxModel,
+    Shape,
+    lagged_inputs,
+    prediction_errors,
+)
 from reactorwatch.stored_state import copy_of
 
 NOISE_SD = np.array([0.1, 0.2])

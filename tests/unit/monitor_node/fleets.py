@@ -7,8 +7,7 @@ import msgspec
 
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
-from monitor_node.fleet.config import WHOLE, Shard
-from monitor_node.fleet.monitor import ANY, FleetMonitor, PlantKind
+from monitor_node.fleet import ANY, WHOLE, FleetMonitor, PlantKind, Shard
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication
 from reactorwatch.contract.messages_pb2 import Alarm, Health

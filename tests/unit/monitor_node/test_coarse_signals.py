@@ -1,4 +1,7 @@
-"""Quantised signals: none is taken for outliers, and one that cannot be monitored does not affect the others."""
+"""Quantised signals: none is taken for outliers, and one that cannot be monitored does not affect the others.
+
+A plant whose sensors have no noise is monitored, though no smallest level was stated.
+"""
 
 import numpy as np
 import pytest
@@ -6,7 +9,12 @@ import pytest
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from monitor_node.learn.training_rows import screen_baseline
+from monitor_node.replay.backtest import run
+from plant_node.config import PlantConfig
+from plant_node.record import simulate_record
+from reactorwatch.contract.codec import encode
 from reactorwatch.kalman.noise_estimation import resolution
+from recorder.tools.player import samples_of
 
 from .samples import Rows
 from .test_many_outputs import config_of, plant, raised, watch
@@ -121,3 +129,11 @@ def test_what_many_values_do_is_no_outlier(share: float) -> None:
     )
     assert screen_baseline(z, 0.33 / np.sqrt(12.0)).outliers == 0
     assert screen_baseline(z).outliers == 0
+
+
+@pytest.mark.parametrize("noise_sd", [{"C": 0.0, "T": 0.0}, {"C": 0.0, "T": 0.3}, {"C": 0.002, "T": 0.0}])
+def test_a_leak_is_seen_without_noise_and_without_a_smallest_level(noise_sd: dict[str, float]) -> None:
+    plant = PlantConfig(seed=5, noise_sd=noise_sd, faults=("coolant_flow:step:-0.05@50min",))
+    messages = (encode(item) for item in samples_of(simulate_record(plant, 600), plant.name))
+    result = run(messages, MonitorConfig(smallest_sd={}, training_min=40, isolation=False, diagnose_training=False))
+    assert min(alarm.raised_ns for alarm, _ in result.raised_alarms) / 60e9 == pytest.approx(50.0, abs=2.0)

@@ -2,15 +2,12 @@
 
 from typing import Any
 
-import numpy as np
 import pytest
 
 from monitor_node.alarms.annunciator import Annunciator
-from monitor_node.causes.isolation import Isolation, causes_of
-from monitor_node.causes.scan import Scan, scan_candidates
-from monitor_node.causes.window import Window
+from monitor_node.causes.isolation import Isolation
 from monitor_node.charts.charts import ChartWatch
-from monitor_node.checks.silence import SilenceCheck
+from monitor_node.checks.signal_checks import SilenceCheck
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from monitor_node.health import Failures
@@ -18,14 +15,10 @@ from monitor_node.watch.pipeline import PlantPipeline
 from reactorwatch.contract.codec import Encoded, Publication
 from reactorwatch.contract.messages_pb2 import Health
 from reactorwatch.errors import InputError
-from reactorwatch.process.library.cstr import cstr
 
 from .fleets import QUICK, SECOND_NS, alarms, alone, fleet, of, row_by_row
 
-CAUSES = causes_of(cstr())
-
 BROKEN = "b"
-LOOKING = MonitorConfig(training_min=20.0)
 MINUTE_NS = 60_000_000_000
 
 
@@ -166,23 +159,6 @@ def test_errors_from_different_places_are_each_reported_once() -> None:
     assert "fail, line" in failures.notes[0]
     assert "please report it" in failures.notes[0]
     assert "\n" not in "".join(failures.notes)
-
-
-def test_no_hypothesis_that_overflowed_is_followed() -> None:
-    """The linearised scan may leave numbers that overflow; then nothing comes into question, and nothing is raised."""
-    shape = (3, 2, 13)
-    scan = Scan(30, np.array([1.0, 2.0, 3.0]), np.full(shape, np.nan), np.full(shape, -np.inf), np.ones(shape))
-    times = np.arange(30) / 10
-    window = Window(
-        times,
-        times[:, None],
-        np.zeros((30, 2)),
-        residual=np.zeros((30, 2)),
-        used=np.ones((30, 2), bool),
-        x=times[:, None],
-        covariance=times[:, None, None],
-    )
-    assert scan_candidates(CAUSES, scan, window) == []
 
 
 def test_settings_that_cannot_be_kept_end_the_monitor_of_one_plant_and_no_fleet() -> None:

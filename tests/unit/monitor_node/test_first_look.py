@@ -9,18 +9,17 @@ import pytest
 from monitor_node import __main__ as monitor_main
 from monitor_node.causes import stage
 from monitor_node.causes.isolation import LOOK_STEPS, LOOK_STEPS_A_ROW, Isolation
-from monitor_node.causes.window import MOST_PIECES, Row, newest_rows
-from monitor_node.charts import drift
+from monitor_node.causes.window import MOST_PIECES, Row
+from monitor_node.charts import shift_and_drift as drift
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
-from monitor_node.fleet.config import FleetConfig
+from monitor_node.fleet import FleetConfig
 from monitor_node.node import MonitorNode
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
-from reactorwatch.codegen.array_function import ArrayFunction
-from reactorwatch.codegen.compiled_function import CompiledFunction
+from reactorwatch.codegen.compiled_function import ArrayFunction, CompiledFunction
 from reactorwatch.kalman import error_dynamics
-from reactorwatch.kalman.batch import STEPS_PER_SEARCH
+from reactorwatch.kalman.batch import StepCost
 from reactorwatch.kalman.ekf_step import compiled_row, predict_function, row_function
 from reactorwatch.kalman.filter_states import correction_function
 from reactorwatch.process.library.cstr import cstr
@@ -125,7 +124,7 @@ def test_an_error_in_what_is_prepared_is_left_to_the_first_look(monkeypatch: pyt
     def fail(_: object) -> None:
         raise RuntimeError("made on purpose")
 
-    monkeypatch.setattr("monitor_node.causes.fit.Fitter._prepare", fail)
+    monkeypatch.setattr("monitor_node.causes.isolation.Fitter._prepare", fail)
     assert len(list(stage.preparation(CONFIG, cstr()))) == 2
     monkeypatch.setattr("monitor_node.causes.isolation.GlrScan", fail)
     assert list(stage.preparation(CONFIG, cstr())) == []
@@ -184,7 +183,7 @@ def test_a_look_takes_no_more_steps_where_rows_are_far_apart(period_min: float, 
     work.forget()
     isolation.suspects(rows, since_rows=100)
     spent, limit = isolation.budget.spent, LOOK_STEPS + LOOK_STEPS_A_ROW * ROWS
-    assert spent <= limit + STEPS_PER_SEARCH + MOST_PIECES + ROWS
+    assert spent <= limit + StepCost.SEARCH + MOST_PIECES + ROWS
     assert work.machine_rows + 3 * work.calls <= spent
 
 
@@ -201,14 +200,3 @@ def test_a_fault_is_found_within_the_budget_where_rows_are_far_apart(fault: str,
     likeliest = isolation.suspects(faulty_rows(fault, period_min, after), since_rows=after)[0]
     assert not isolation.stopped
     assert (likeliest.cause, likeliest.probability > 0.5) == (fault.split(":")[0], True)
-
-
-@pytest.mark.parametrize("period_min", [0.1, 1.0, 5.0, 29.0])
-def test_of_rows_far_apart_the_newest_are_looked_at_and_all_since_the_alarm(period_min: float) -> None:
-    rows: list[Row] = [(period_min * place, (100.0,), (0.1, 440.0)) for place in range(ROWS)]
-    kept = newest_rows(rows)
-    pieces = max(round(period_min / 0.1) - 1, 0)
-    assert list(kept) == rows[-len(kept) :]
-    assert pieces * (len(kept) - 1) <= MOST_PIECES
-    assert len(kept) == ROWS or pieces * len(kept) > MOST_PIECES
-    assert len(newest_rows(rows, 400)) == max(400, len(kept))

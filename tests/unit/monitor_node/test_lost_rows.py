@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from monitor_node.causes.isolation import UNKNOWN, Isolation
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
-from monitor_node.ingest.rows import Interval, MeasuredRow, missing_rows
+from monitor_node.ingest.rows import Interval, MeasuredRow
 from monitor_node.learn.process_reference import ProcessMemory, ProcessReference, input_reach
 from reactorwatch.contract.codec import Encoded
 from reactorwatch.contract.messages_pb2 import Alarm, Sample
@@ -26,7 +26,6 @@ Reference = Literal["process", "arx", "black-box"]
 TRAINED, ROWS, AT = 420, 520, 450
 """Rows until the monitors of the tests are past their training, rows in all, and the row of the move."""
 
-SIGNALS = ("qc", "C", "T")
 HOUR_NS = 3600 * 10**9
 
 
@@ -94,20 +93,6 @@ def stamped(message: Encoded, by_ns: int) -> Encoded:
 
 LOST = st.just({0, 1, 2}) | st.sets(st.sampled_from(range(3)), min_size=1)
 """Places of the signals of a row that are lost: all, as when a row is lost, or some."""
-
-
-@pytest.mark.parametrize("move", [-13.0, -8.0, 8.0])
-@pytest.mark.parametrize("by_ns", [0, -HOUR_NS])
-@pytest.mark.parametrize("reference", ["process", "black-box"])
-def test_the_row_of_a_move_that_is_lost_or_stamped_an_hour_early_raises_no_alarm(
-    trained: dict[tuple[str, str], bytes], reference: Reference, move: float, by_ns: int
-) -> None:
-    qc = steps()
-    qc[TRAINED:AT], qc[AT:] = 103.0, 103.0 + move
-    messages = sound(qc, seed=6)
-    moved = [stamped(message, by_ns) for message in messages[3 * AT : 3 * AT + 3]] if by_ns else []
-    left = [*messages[3 * TRAINED : 3 * AT], *moved, *messages[3 * AT + 3 :]]
-    assert raised(trained[reference, "held"], reference, left) == set()
 
 
 @settings(max_examples=20, deadline=None)
@@ -228,13 +213,6 @@ def test_the_reach_of_an_input_is_how_far_it_went_and_came_back_at_once() -> Non
     gap = np.append(time_min[:3], time_min[3:] + 0.1)
     assert input_reach(gap, np.array([1.0, 1, 4, 2, 2, 2, 2, 2])) == 0.0
     assert input_reach(time_min[:1], np.ones(1)) == 0.0
-
-
-@pytest.mark.parametrize(
-    ("periods", "missing"), [(1.0, 0), (0.2, 0), (1.5, 0), (1.7, 0), (1.9, 1), (2.0, 1), (2.2, 1), (3.0, 2), (-1.0, 0)]
-)
-def test_rows_are_missing_where_whole_periods_are_between(periods: float, missing: int) -> None:
-    assert missing_rows(periods) == missing
 
 
 @pytest.mark.parametrize("fault", ["", "coolant_flow:step:-0.05"])

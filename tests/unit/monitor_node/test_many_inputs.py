@@ -131,7 +131,7 @@ def check_equality(plant: Plant, config: MonitorConfig, stopped: float) -> None:
     assert verify(lambda: log, config).exact
     assert monitor.failures.by_stage == {}
     estimated = {item.key.rpartition("/")[2] for item in published if isinstance(item.message, Estimate)}
-    assert monitor.phase == "training" or estimated | set(result.left_out) >= set(plant.outputs)
+    assert monitor.phase == "training" or estimated | set(result.exclusions) >= set(plant.outputs)
 
 
 @pytest.mark.parametrize("inputs", range(5))
@@ -139,7 +139,7 @@ def check_equality(plant: Plant, config: MonitorConfig, stopped: float) -> None:
 def test_a_fault_of_one_output_is_seen_with_any_number_of_inputs(inputs: int, outputs: int) -> None:
     plant = linear_plant(inputs, outputs, seed=3)
     result = backtest.run(plant.messages(), plant.config(reference="arx"))
-    assert result.left_out == {}
+    assert result.exclusions == {}
     raised = {alarm.alarm: alarm.raised_ns for alarm, _ in result.raised_alarms}
     assert raised[f"shewhart/y{outputs - 1}"] < START_NS + (FAULT_ROW + 6) * ROW_NS
 

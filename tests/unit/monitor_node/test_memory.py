@@ -11,7 +11,7 @@ from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded
-from reactorwatch.runtime.bus_zenoh.bus import cache_size
+from reactorwatch.runtime.bus_zenoh.messages import cache_size
 
 from .fleets import fleet, of_plant
 from .samples import leaking_run, samples

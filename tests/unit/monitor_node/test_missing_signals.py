@@ -7,10 +7,10 @@ from msgspec.structs import replace
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from monitor_node.replay import backtest
-from monitor_node.replay.backtest import Backtest
 from reactorwatch.contract.codec import Encoded, Publication
 from reactorwatch.contract.messages_pb2 import Alarm
 from reactorwatch.records.record import MINUTE_NS
+from reactorwatch.results.backtest import Backtest
 
 from .samples import Rows, leaking_run, sample
 
@@ -53,7 +53,7 @@ def test_without_one_signal_its_silence_is_reported_and_the_others_are_monitored
 ) -> None:
     config = replace(CONFIG, reference=reference)
     result = watch(leak, signal, config=config)
-    assert result.left_out == {signal: "no value of it has come"}
+    assert result.exclusions == {signal: "no value of it has come"}
     assert f"training: {signal} is left out: no value of it has come" in result.notes
     assert result.watching_since_ns == 40 * MINUTE_NS
     raised = raised_min(result)
@@ -69,14 +69,14 @@ def test_a_signal_that_ends_in_the_training_ends_no_training(signal: str, last: 
     result = watch(leak, signal, 0, last)
     assert result.watching_since_ns == 40 * MINUTE_NS
     assert 0.1 * last < raised_min(result)[f"silence/{signal}"] < 0.1 * last + 10.1
-    assert set(result.left_out) == ({signal} if last < 50 else set())
+    assert set(result.exclusions) == ({signal} if last < 50 else set())
 
 
 def test_a_signal_that_arrives_after_the_training_ends_its_silence_and_is_reported_as_not_monitored(leak: Run) -> None:
     result = watch(leak, "T", 500, 801)
     ends = {alarm.alarm: cleared_ns for alarm, cleared_ns in result.raised_alarms}
     assert ends["silence/T"] == 50 * MINUTE_NS
-    assert result.left_out == {"T": "its first value came after the training"}
+    assert result.exclusions == {"T": "its first value came after the training"}
     assert result.notes[-1] == "T comes now, and is not watched: start the monitor without its state to learn it"
 
 

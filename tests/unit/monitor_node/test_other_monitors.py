@@ -5,7 +5,7 @@ from itertools import combinations_with_replacement
 import pytest
 
 from monitor_node.config import MonitorConfig
-from monitor_node.fleet.config import FleetConfig, shard_of
+from monitor_node.fleet import FleetConfig, shard_of
 from monitor_node.health import GONE, MOST_GROUPS, NOTICED, OtherMonitors
 from monitor_node.node import MonitorNode
 from reactorwatch.contract import keys

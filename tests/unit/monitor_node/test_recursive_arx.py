@@ -5,12 +5,10 @@ import pytest
 
 from monitor_node.config import ReferenceName
 from monitor_node.core import Monitor
-from monitor_node.learn.arx import COPY_ROWS, LaggedRows
+from monitor_node.learn.references import COPY_ROWS
 from reactorwatch.arrays import Array
 from reactorwatch.contract.codec import Publication
 from reactorwatch.contract.messages_pb2 import Estimate, ModelSnapshot
-from reactorwatch.identification.structure import Structure
-from reactorwatch.stored_state import copy_of
 from tests.exchanger import config_of, random_exchanger, simulate
 
 from .samples import feed_row
@@ -96,16 +94,3 @@ def test_an_outlier_teaches_it_nothing(plant: tuple[Array, Array]) -> None:
     before = adapted(monitor)
     take(monitor, 1100, (float(flow[1100]), float(measured[1100]) + 50.0))
     assert adapted(monitor) == before
-
-
-def test_stored_lagged_rows_resume_where_they_were() -> None:
-    structure = Structure(3, 2, delay=2, inputs=2)
-    lagged, rng = LaggedRows(structure), np.random.default_rng(2)
-    for _ in range(12):
-        resumed = copy_of(lagged)
-        u, y = rng.standard_normal(2).tolist(), float(rng.standard_normal())
-        expected, got = lagged.update(u, y), resumed.update(u, y)
-        np.testing.assert_array_equal(np.array(expected, dtype=float), np.array(got, dtype=float))
-        assert resumed == lagged
-    with pytest.raises(ValueError, match="there must be at most 3 equal rows"):
-        LaggedRows(structure, outputs=[1.0] * 4, inputs=[1.0] * 8)

@@ -7,10 +7,11 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from monitor_node.config import MonitorConfig
-from monitor_node.ingest.alignment import Aligner
-from monitor_node.replay.backtest import Backtest, run
+from monitor_node.ingest.rows import Aligner
+from monitor_node.replay.backtest import run
 from reactorwatch.contract.codec import encode
 from reactorwatch.records.record import MINUTE_NS, Record
+from reactorwatch.results.backtest import Backtest
 from recorder.tools.player import samples_of
 
 from .samples import leaking_run

@@ -130,58 +130,6 @@ def test_without_any_disturbance_only_the_leak_is_alarmed(undisturbed: RunOutput
     assert counted.late == counted.lost == counted.duplicated == counted.out_of_order == counted.incomplete_rows == 0
 
 
-# --- doubled, late, out of order -----------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("rows_later", [0, 7])
-def test_a_sample_that_comes_twice_changes_nothing(leaking: Run, undisturbed: RunOutput, rows_later: int) -> None:
-    messages = leaking.messages()
-    doubled: list[Encoded] = []
-    for index, message in enumerate(messages):
-        doubled.append(message)
-        if index % 5 == 0 and index >= 3 * rows_later:
-            doubled.append(messages[index - 3 * rows_later])
-    output = watched(doubled)
-    assert output.published == undisturbed.published
-    assert output.health.duplicated == len(doubled) - len(messages)
-    assert output.health.late == output.health.lost == 0
-
-
-def test_a_sample_that_comes_after_its_row_was_given_up_changes_nothing_but_the_count(leaking: Run) -> None:
-    def held_back(row: int, signal: str) -> bool:
-        return row % 40 == 5 and signal == "T"
-
-    never = leaking.messages(held_back)
-    tardy: list[Encoded] = []
-    for number, time_min, values in leaking.rows:
-        if number >= 20 and held_back(number - 20, "T"):
-            tardy.append(sample("T", number - 20, time_min - 2.0, leaking.rows[number - 20][2][2]))
-        tardy += [
-            sample(signal, number, time_min, value)
-            for signal, value in zip(SIGNALS, values, strict=True)
-            if not held_back(number, signal)
-        ]
-    without, output = watched(never), watched(tardy)
-    assert output.published == without.published
-    assert without.health.late == 0
-    assert output.health.late == len(tardy) - len(never)
-    assert output.health.late > 20
-    assert output.health.incomplete_rows == without.health.incomplete_rows
-
-
-def test_samples_out_of_order_by_a_few_rows_change_nothing_but_the_count(leaking: Run, undisturbed: RunOutput) -> None:
-    messages, order = leaking.messages(), random.Random(5)
-    shuffled = messages[:3]
-    for start in range(3, len(messages), 12):
-        part = messages[start : start + 12]
-        order.shuffle(part)
-        shuffled += part
-    output = watched(shuffled)
-    assert output.published == undisturbed.published
-    assert output.health.out_of_order > 0
-    assert output.health.late == output.health.lost == 0
-
-
 # --- missing -------------------------------------------------------------------------------------------------
 
 
@@ -261,21 +209,20 @@ def test_irregular_intervals_raise_no_alarm_in_a_sound_plant(spread: float) -> N
 # --- the plant's clock ---------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("by_min", [0.05, 60.0])
-def test_a_clock_that_is_set_forward_raises_no_alarm_and_the_plant_is_watched_on(sound: Run, by_min: float) -> None:
-    output = watched(sound.moved(EVENT, by_min).messages())
+@pytest.mark.parametrize(
+    ("by_min", "anew"),
+    [
+        *((by_min, False) for by_min in (0.05, 60.0, -0.5, -3.0, -10.0, -79.0)),
+        *((by_min, True) for by_min in (-79.0, -3.0, 500.0)),
+    ],
+)
+def test_a_clock_that_is_set_and_a_publisher_that_begins_again_raise_no_alarm_and_the_plant_is_watched_on(
+    sound: Run, by_min: float, *, anew: bool
+) -> None:
+    """The numbers go on, or begin again, so the samples are new, however old their times."""
+    output = watched(sound.moved(EVENT, by_min, numbered_from_0=anew).messages())
     assert output.raised == []
     assert output.phase == "watching"
-    assert output.health.rows == ROWS
-    assert output.health.lost == 0
-    assert {("C", to_time_ns(109.0 + by_min)), ("T", to_time_ns(109.0 + by_min))} <= output.estimated.keys()
-
-
-@pytest.mark.parametrize("by_min", [-0.5, -3.0, -10.0, -79.0])
-def test_a_clock_that_is_set_back_raises_no_alarm_and_the_plant_is_watched_on(sound: Run, by_min: float) -> None:
-    """The numbers go on, so the samples are new, however old their times."""
-    output = watched(sound.moved(EVENT, by_min).messages())
-    assert output.raised == []
     assert output.health.rows == ROWS
     assert output.health.late == output.health.lost == output.health.duplicated == 0
     assert {("C", to_time_ns(109.0 + by_min)), ("T", to_time_ns(109.0 + by_min))} <= output.estimated.keys()
@@ -288,16 +235,6 @@ def test_a_gap_in_the_samples_is_counted_and_raises_no_alarm(sound: Run, rows: i
     assert output.health.lost == 3 * rows
     assert output.health.incomplete_rows == 0
     assert {("C", to_time_ns(109.0)), ("T", to_time_ns(109.0))} <= output.estimated.keys()
-
-
-@pytest.mark.parametrize("by_min", [-79.0, -3.0, 500.0])
-def test_a_publisher_that_begins_again_at_any_time_raises_no_alarm_and_is_watched_on(sound: Run, by_min: float) -> None:
-    output = watched(sound.moved(EVENT, by_min, numbered_from_0=True).messages())
-    assert output.raised == []
-    assert output.phase == "watching"
-    assert output.health.rows == ROWS
-    assert output.health.late == output.health.lost == output.health.duplicated == 0
-    assert {("C", to_time_ns(109.0 + by_min)), ("T", to_time_ns(109.0 + by_min))} <= output.estimated.keys()
 
 
 @pytest.mark.parametrize(

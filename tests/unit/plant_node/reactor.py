@@ -1,4 +1,4 @@
-"""The reactor once more, by hand and with SciPy's solver: the truth that the plant is held against."""
+"""The reactor by hand and with SciPy's solver, which the plant is compared with, and rows of a plant."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -7,6 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
+
+from plant_node.core import Plant, Row
 
 Array = NDArray[np.float64]
 
@@ -63,3 +65,14 @@ def resting(qc: float) -> Array:
     """(C, T, V) at the hottest steady state at a real coolant flow between 80 and 120 l/min."""
     T = float(brentq(lambda T: coolant_for(T) - qc, 428.0, 470.0, xtol=1e-10))
     return np.array([1.0 / (1.0 + 7.2e10 * np.exp(-1e4 / T)), T, 100.0])
+
+
+QUIET = {"C": 0.0, "T": 0.0, "qc": 0.0}
+
+
+def rows(of: Plant, count: int) -> list[Row]:
+    return [of.next_row() for _ in range(count)]
+
+
+def column(found: list[Row], signal: str) -> NDArray[np.float64]:
+    return np.array([row.readings[signal] for row in found])

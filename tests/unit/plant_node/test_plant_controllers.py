@@ -1,4 +1,4 @@
-"""The temperature controller: its law, its stability, manual and automatic."""
+"""The temperature and level controllers: their laws, their stability, manual and automatic."""
 
 import math
 from dataclasses import replace
@@ -10,16 +10,15 @@ import pytest
 from scipy.optimize import brentq
 
 from plant_node.config import PlantConfig
-from plant_node.core import Plant
+from plant_node.core import Plant, Row
 from plant_node.record import plant_from, simulate_record
 from plant_node.scenario import FromFile, scenario_settings
 from reactorwatch.errors import InputError
 from reactorwatch.process.fault import parse_fault
 from reactorwatch.process.library.cstr import cstr
-from reactorwatch.process.library.cstr_operation import OPERATION, TemperatureControl
+from reactorwatch.process.library.cstr_operation import OPERATION, LevelControl, TemperatureControl
 from reactorwatch.runtime.config import section
-from tests.unit.plant_node.reactor import Reactor, coolant_for, resting
-from tests.unit.plant_node.rows import QUIET, column, rows
+from tests.unit.plant_node.reactor import QUIET, Reactor, column, coolant_for, resting, rows
 
 GAIN = TemperatureControl().gain_l_min_K
 PERIOD_MIN = 0.1
@@ -69,7 +68,7 @@ def test_the_plant_under_control_settles_as_fast_as_its_eigenvalues(flow_l_min: 
 
 def test_beyond_the_gain_that_the_eigenvalues_allow_the_plant_swings() -> None:
     critical = brentq(lambda gain: radius(85.0, gain) - 1, 10, 30, xtol=1e-3)
-    assert critical == pytest.approx(18.0, abs=0.1)  # as controllers.py says
+    assert critical == pytest.approx(18.0, abs=0.1)  # l/min/K
     rest = resting(85.0)
     swing = {}
     for share in (0.9, 1.1):
@@ -124,16 +123,6 @@ def test_it_starts_and_stays_at_rest_where_the_balances_and_the_law_meet(share: 
     )
     found = rows(plant(control, faults=tuple(faults)), 50)
     np.testing.assert_allclose(column(found, "T"), expected + bias_K, rtol=0, atol=1e-5)
-
-
-def test_a_leak_moves_the_temperature_less_under_control() -> None:
-    """To where balances and law meet, by the offset of a controller without integral action."""
-    leak = ("coolant_flow:step:-0.1@1min",)
-    controlled = column(rows(plant(TemperatureControl(), faults=leak), 300), "T")
-    expected = brentq(lambda T: coolant_for(T) / 0.9 - 103.41 - 4.0 * (T - 438.54), 430.0, 460.0, xtol=1e-10)
-    assert controlled[-1] == pytest.approx(expected, abs=1e-4)
-    open_loop = float(resting(0.9 * 103.41)[1])
-    assert 0 < expected - 438.54 < 0.3 * (open_loop - 438.54)
 
 
 def test_a_reactor_that_is_out_is_lit_again() -> None:
@@ -201,13 +190,6 @@ def test_a_coolant_flow_that_is_set_is_manual_and_a_set_point_is_automatic() -> 
     assert set(column(manual, "qc")) == {100.0}
     assert manual[-1].readings["T"] == pytest.approx(441.2184, abs=1e-3)  # the published operating point
     np.testing.assert_allclose(column(after, "qc"), 103.41 + GAIN * (column(after, "T") - 437.0), rtol=1e-12)
-
-
-def test_open_loop_has_no_set_point() -> None:
-    running = plant_from(PlantConfig())
-    assert running.mode == "open loop"
-    with pytest.raises(InputError, match=r"^unknown input 'T' \(valid: qc\)$"):
-        running.set_input("T", 440.0)
 
 
 @pytest.mark.parametrize(
@@ -279,3 +261,90 @@ def test_a_model_that_does_not_measure_the_temperature_cannot_be_controlled() ->
     blind = replace(model, outputs=model.outputs[:1])
     with pytest.raises(InputError, match=r"^controller of 'qc' needs a model with the output 'T', cstr has \('C',\)$"):
         plant_from(PlantConfig(temperature_control=TemperatureControl()), blind)
+
+
+def level_plant(gain_per_min: float | None = 2.0, **settings: Any) -> Plant:
+    level = None if gain_per_min is None else LevelControl(gain_per_min)
+    values = {"noise_sd": QUIET, "scenario": "constant", "level_control": level, **settings}
+    return plant_from(PlantConfig(**values))
+
+
+def rows_and_volumes(of: Plant, count: int) -> tuple[list[Row], list[float]]:
+    """Rows, and the volume at each."""
+    found, volumes = [], []
+    for _ in range(count):
+        volumes.append(of.state["V"])
+        found.append(of.next_row())
+    return found, volumes
+
+
+def test_without_a_change_of_the_inflow_it_is_the_plant_of_constant_volume() -> None:
+    held, constant = level_plant(scenario="random-steps"), level_plant(None, scenario="random-steps")
+    found, volumes = rows_and_volumes(held, 300)
+    assert set(volumes) == {100.0}
+    for row in found:
+        assert row.readings == pytest.approx(constant.next_row().readings, rel=0, abs=1e-7)
+
+
+def test_its_signals_are_those_of_every_plant() -> None:
+    assert set(level_plant().units) == {"qc", "C", "T"}
+    assert set(level_plant().state) == {"C", "T", "V"}
+
+
+def test_rows_with_a_fault_of_the_inflow_are_those_of_scipy_s_balances() -> None:
+    """The balances of amount and heat in a volume that moves, which the model does not use in this form."""
+    running = level_plant(faults=("feed_flow:step:0.2@1min",), scenario="random-steps")
+    found, volumes = rows_and_volumes(running, 60)
+    state = resting(found[0].readings["qc"])
+    for row, volume in zip(found, volumes, strict=True):
+        shown = [row.readings["C"], row.readings["T"], volume]
+        np.testing.assert_allclose(shown, state, rtol=0, atol=2e-5)
+        reactor = Reactor(q=120.0 if row.number >= 10 else 100.0, level_gain=2.0)
+        state = reactor.after(state, row.readings["qc"], 0.1)
+
+
+def test_the_level_follows_the_inflow_with_the_time_constant_and_the_offset_of_its_controller() -> None:
+    """dV/dt = q m - Kc (V - 100): to 100 + q m / Kc as 1 - exp(-Kc t); and from there back when the fault is gone."""
+    running = level_plant()
+    _, before = rows_and_volumes(running, 10)
+    running.inject(parse_fault("feed_flow:step:-0.1"))
+    _, during = rows_and_volumes(running, 40)
+    running.clear("feed_flow")
+    _, after = rows_and_volumes(running, 40)
+    since = np.arange(40) / 10
+    np.testing.assert_allclose(before, 100.0, rtol=1e-12)
+    np.testing.assert_allclose(during, 100.0 - 5.0 * (1 - np.exp(-2 * since)), rtol=0, atol=1e-5)
+    gone = -5.0 * (1 - np.exp(-2 * 4.0))
+    np.testing.assert_allclose(after, 100.0 + gone * np.exp(-2 * since), rtol=0, atol=1e-5)
+
+
+def test_it_starts_at_the_level_that_a_fault_of_always_keeps() -> None:
+    running = level_plant(faults=("feed_flow:constant:0.1",))
+    found, volumes = rows_and_volumes(running, 30)
+    np.testing.assert_allclose(volumes, 105.0, rtol=1e-9)
+    temperatures = [row.readings["T"] for row in found]
+    np.testing.assert_allclose(temperatures, temperatures[0], rtol=0, atol=1e-5)
+
+
+def test_a_start_without_a_level_has_it_at_rest() -> None:
+    running = level_plant(start={"C": 0.1, "T": 438.54})
+    assert running.state == pytest.approx({"C": 0.1, "T": 438.54, "V": 100.0})
+    assert level_plant(start={"C": 0.1, "T": 438.54, "V": 90.0}).state["V"] == 90.0
+
+
+def test_both_controllers_work_together() -> None:
+    running = level_plant(temperature_control=TemperatureControl(), faults=("feed_flow:step:0.1@1min",))
+    found, volumes = rows_and_volumes(running, 400)
+    assert found[5].readings["T"] == pytest.approx(438.54, abs=1e-3)
+    assert volumes[-1] == pytest.approx(105.0, abs=1e-6)
+    # Where it comes to rest: the balances do not change any more at the flow that is commanded.
+    last = np.array([found[-1].readings["C"], found[-1].readings["T"], volumes[-1]])
+    on = Reactor(q=110.0, level_gain=2.0).after(last, found[-1].readings["qc"], 0.5)
+    np.testing.assert_allclose(on, last, rtol=0, atol=1e-4)
+
+
+def test_a_model_without_a_volume_is_refused() -> None:
+    model = cstr()
+    without = replace(model, parameters=tuple(item for item in model.parameters if item.name != "V"))
+    with pytest.raises(InputError, match=r"^settings \[plant\]: level_control: cstr has no parameter 'V'"):
+        plant_from(PlantConfig(level_control=LevelControl()), without)

@@ -19,7 +19,7 @@ from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.simulate import Simulator
 from reactorwatch.records.record import Record
 from tests.tables import read_csv
-from tests.unit.plant_node.rows import QUIET, column, rows
+from tests.unit.plant_node.reactor import QUIET, column, rows
 
 
 def plant(model: ProcessModel | None = None, **settings: object) -> Plant:
@@ -27,36 +27,9 @@ def plant(model: ProcessModel | None = None, **settings: object) -> Plant:
     return plant_from(PlantConfig(**values), model)  # type: ignore[arg-type]
 
 
-def test_same_seed_gives_the_same_rows_bit_for_bit() -> None:
-    config = PlantConfig(seed=3, faults=("coolant_flow:step:-0.05@4.23min",))
-    one, other = simulate_record(config, 200), simulate_record(config, 200)
-    for signal in ("qc", "C", "T"):
-        np.testing.assert_array_equal(one.columns[signal], other.columns[signal])
-
-
-def test_rows_do_not_depend_on_how_many_are_asked_for() -> None:
-    config = PlantConfig(seed=3)
-    long, short = simulate_record(config, 300), simulate_record(config, 100)
-    np.testing.assert_array_equal(long.columns["T"][:100], short.columns["T"])
-
-
-def test_noise_of_one_signal_leaves_the_others_alone() -> None:
-    noisy, quiet = (simulate_record(PlantConfig(noise_sd={"C": sd}), 200) for sd in (0.002, 0.0))
-    np.testing.assert_array_equal(noisy.columns["T"], quiet.columns["T"])
-    assert not np.any(noisy.columns["C"] == quiet.columns["C"])
-
-
 def test_times_are_decimal_minutes() -> None:
     record = simulate_record(PlantConfig(noise_sd=QUIET), 400)
     assert record.time_min.tolist() == [float(f"{number / 10}") for number in range(400)]
-
-
-def test_record_is_a_free_run_of_the_equations_with_its_own_input() -> None:
-    """Row k is measured at t_k, and its input is held until the next row."""
-    record = simulate_record(PlantConfig(noise_sd=QUIET, seed=8, start={"C": 0.11, "T": 437.0}), 600)
-    run = Simulator(cstr()).run(record.time_min, record.columns["qc"], np.array([0.11, 437.0]))
-    np.testing.assert_allclose(record.columns["C"], run.outputs[:, 0], rtol=0, atol=1e-9)
-    np.testing.assert_allclose(record.columns["T"], run.outputs[:, 1], rtol=0, atol=1e-6)
 
 
 def test_faulty_record_is_a_free_run_of_the_extended_model_while_qc_stays_the_command() -> None:
@@ -245,12 +218,6 @@ def test_where_the_equations_end_the_state_is_held_and_marked_until_they_resume(
     assert set(column(good + bad + after, "T")) == {400.0}
     assert [row.number for row in good + bad + after] == list(range(10))
     assert running.trouble is None
-
-
-def test_sensors_resolve_what_they_can() -> None:
-    found = plant(scenario="random-steps", noise_sd={}, resolution={"T": 0.5})
-    readings = column(rows(found, 50), "T")
-    np.testing.assert_allclose(readings * 2, np.round(readings * 2), atol=1e-9)
 
 
 @pytest.mark.parametrize(

@@ -8,9 +8,9 @@ from google.protobuf.message import Message
 
 from plant_node.__main__ import serve_plant
 from plant_node.config import PlantConfig
-from plant_node.node import BATCH, COMMANDS, PlantNode
+from plant_node.node import BATCH, PlantNode
 from plant_node.record import plant_from, simulate_record
-from reactorwatch.contract.codec import Encoded, Publication, decode, encode, encode_message
+from reactorwatch.contract.codec import Encoded, Publication, encode_message
 from reactorwatch.contract.messages_pb2 import (
     ClearFault,
     CommandReply,
@@ -229,49 +229,6 @@ def test_what_cannot_be_done_is_refused_with_the_reason(name: str, message: Mess
     assert bench.logged == []
     (last,) = health_in(bench.node.on_stop(START_NS))
     assert (last.received, last.refused, sum(last.refused_by_reason.values())) == (1, 1, 1)
-
-
-@pytest.mark.parametrize("name", COMMANDS)
-@pytest.mark.parametrize(
-    ("payload", "encoding"),
-    [(b"", ""), (b"\xff\xff", "application/protobuf;reactorwatch.v1.SetInput"), (b"{}", "application/json")],
-)
-def test_bytes_that_are_no_command_are_refused(name: str, payload: bytes, encoding: str) -> None:
-    bench = Bench()
-    reply, publications = bench.node.on_command(Encoded(f"reactor/cstr/command/{name}", payload, encoding), START_NS)
-    assert not reply.accepted
-    assert len(reply.text.splitlines()) == 1
-    assert publications == []
-
-
-def test_published_messages_of_others_do_not_concern_it() -> None:
-    bench = Bench()
-    sample = encode(Publication("reactor/cstr/sample/T", Sample(time_ns=1, value=1.0)))
-    assert bench.node.on_message(sample, START_NS) == []
-
-
-def test_served_on_a_bus_it_publishes_its_record_and_then_leaves() -> None:
-    config = PlantConfig(duration_min=40.0, speed=inf, seed=9, faults=("coolant_flow:step:-0.05@30min",))
-    exchange = Exchange()
-    listener, bus = MemoryBus(exchange), MemoryBus(exchange)
-    heard: list[Encoded] = []
-    alive: list[tuple[str, bool]] = []
-    listener.subscribe("reactor/**", heard.append)
-    listener.subscribe_liveliness("reactor/**", lambda key, is_alive: alive.append((key, is_alive)))
-    serve_plant(PlantNode(plant_from(config), config, lambda text: None), config, bus, StopSignal())
-    bus.close()
-    expected = simulate_record(config)
-    for signal in ("qc", "C", "T"):
-        messages = [
-            decode(item.payload, item.encoding) for item in heard if item.key == f"reactor/cstr/sample/{signal}"
-        ]
-        values = [message.value for message in messages if isinstance(message, Sample)]
-        assert values == expected.columns[signal].tolist()
-    assert len([item for item in heard if item.key == "reactor/cstr/fault/coolant_flow"]) == 1
-    last = decode(heard[-1].payload, heard[-1].encoding)
-    assert isinstance(last, Health)
-    assert (last.phase, last.rows, last.published) == ("stopped", 400, len(heard))
-    assert alive == [("reactor/cstr/alive/plant", True), ("reactor/cstr/alive/plant", False)]
 
 
 def test_it_waits_for_the_nodes_in_its_settings_and_serves_commands_while_it_runs() -> None:

@@ -13,14 +13,14 @@ from plant_node.record import plant_from, simulate_record
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, encode_message
 from reactorwatch.contract.messages_pb2 import InjectFault, SetInput
-from reactorwatch.description.find import find_process
 from reactorwatch.description.process import Process, Signal
+from reactorwatch.description.read import find_process
 from reactorwatch.errors import InputError
 from reactorwatch.process import MODELS
 from reactorwatch.process.operation import Controller
 from reactorwatch.process.simulate import Simulator
 from reactorwatch.runtime.config import section
-from tests.unit.plant_node.rows import column, rows
+from tests.unit.plant_node.reactor import column, rows
 
 NAMES = [make().name for make in MODELS]
 RIG = """

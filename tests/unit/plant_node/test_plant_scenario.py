@@ -77,10 +77,6 @@ def test_random_steps_hold_and_fill_their_range() -> None:
     assert abs(np.corrcoef(steps[1:], steps[:-1])[0, 1]) < 4 / np.sqrt(300)
 
 
-def test_another_seed_is_another_input() -> None:
-    assert not np.any(levels(OF_ALL_KINDS[0], seed=0)[::10] == levels(OF_ALL_KINDS[0], seed=1)[::10])
-
-
 def test_sines_match_their_stated_sum() -> None:
     scenario = Sines(mean=100.0, amplitudes=(4.0, 2.0), periods_min=(3.0, 7.0), phases=(0.0, 1.0))
     expected = 100 + 4 * np.sin(2 * np.pi * TIMES / 3) + 2 * np.sin(2 * np.pi * TIMES / 7 + 1)

@@ -11,10 +11,19 @@ from reactorwatch.arrays import Array
 from reactorwatch.errors import InputError
 from reactorwatch.process import MODELS
 from reactorwatch.process.extended_model import extended_model_of, parse_extended_model
-from reactorwatch.process.law import APART, FORMS, LAG, ExtendedLaw, Form
+from reactorwatch.process.law import (
+    APART,
+    FORMS,
+    LAG,
+    ExtendedLaw,
+    Form,
+    correct,
+    places_of,
+    unit_of,
+    variable_expression,
+)
 from reactorwatch.process.library.cstr import cstr
 from reactorwatch.process.model import Place, ProcessModel
-from reactorwatch.process.places import correct, places_of, unit_of, variable_expression
 from reactorwatch.process.simulate import Simulator
 
 LOSS = ExtendedLaw("energy balance", "power", ("T",), (440.0,), {"a": -0.9, "n": 4.0}, {"T": (425.0, 452.0)})

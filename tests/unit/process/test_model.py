@@ -6,7 +6,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from reactorwatch.codegen.array_function import ArrayFunction
+from reactorwatch.codegen.compiled_function import ArrayFunction
 from reactorwatch.process.library.cstr import cstr
 from reactorwatch.process.model import parameter
 

@@ -11,7 +11,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from reactorwatch.arrays import Array
-from reactorwatch.codegen.array_function import ArrayFunction
+from reactorwatch.codegen.compiled_function import ArrayFunction
 from reactorwatch.process.library.cstr import OPERATING_STATE, cstr
 from reactorwatch.process.profiles import STEP
 from reactorwatch.process.simulate import SimulationError, Simulator, Stepper, step_grid, symbolic_step

@@ -7,9 +7,8 @@ from scipy.optimize import brentq
 
 from reactorwatch.arrays import Array
 from reactorwatch.process.library.cstr import cstr
-from reactorwatch.process.linearise import compare_step, linearise, step_response
 from reactorwatch.process.model import ProcessModel
-from reactorwatch.process.steady_state import SteadyState, steady_states
+from reactorwatch.process.steady_state import SteadyState, compare_step, linearise, steady_states, step_response
 
 # Computed from the published equations of the benchmark (De Moor, DaISy; Lightbody & Irwin 1997) by the project's
 # plant description: coolant flow, C, T on the operating branch, one eigenvalue of the pair (or both, if real).

@@ -10,10 +10,16 @@ import pytest
 from reactorwatch.errors import InputError
 from reactorwatch.process import MODELS, named_effects
 from reactorwatch.process.effect import Effect
-from reactorwatch.process.extended_model import ExtendedModel, parse_extended_model
+from reactorwatch.process.extended_model import (
+    BINARY,
+    UNARY,
+    ExtendedModel,
+    build_equations,
+    parse_extended_model,
+    store_equations,
+)
 from reactorwatch.process.fault import parse_fault
 from reactorwatch.process.model import ProcessModel, fingerprint
-from reactorwatch.process.stored_equations import BINARY, UNARY, build_equations, store_equations
 from tests.unit.diagnosis.linear_tank import tank
 
 SHIPPED = [make() for make in MODELS]

@@ -6,9 +6,8 @@ from scipy.integrate import solve_ivp
 
 from reactorwatch.process.library.cascaded_tanks import EFFECTS as TANK_EFFECTS
 from reactorwatch.process.library.cascaded_tanks import tanks
-from reactorwatch.process.linearise import linearise
 from reactorwatch.process.simulate import Simulator
-from reactorwatch.process.steady_state import steady_states
+from reactorwatch.process.steady_state import linearise, steady_states
 
 TIMES = np.arange(60) / 15
 FLOWS = np.repeat(np.random.default_rng(1).uniform(2.0, 5.0, 12), 5)

@@ -1,17 +1,21 @@
-"""A recorder without a bus, fed by hand with messages and a clock."""
+"""A recorder fed by hand with messages and a clock, recordings of given messages, and a disk that fills up."""
 
-from collections.abc import Callable, Collection, Iterable
+import errno
+import os
+from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from reactorwatch.contract.codec import Encoded, Publication, encode
-from reactorwatch.contract.messages_pb2 import Alarm, Health
+from reactorwatch.contract import keys
+from reactorwatch.contract import messages_pb2 as messages
+from reactorwatch.contract.codec import Body, Encoded, Publication, decode, encode
+from reactorwatch.contract.messages_pb2 import Alarm, Health, Sample
+from recorder import RecordedMessage
 from recorder.config import RecorderConfig
-from recorder.files.ages import BootClock
-from recorder.files.part_file import PartFile
-from recorder.files.writer import part_of
+from recorder.files.recording import Recording
+from recorder.files.writer import PartFile, RecordingWriter, part_of
 from recorder.node import RecorderNode
-from recorder.recording_files import RecordingFiles
+from recorder.recording_files import BootClock, RecordingFiles
 
 SECOND = 1_000_000_000
 MINUTE = 60 * SECOND
@@ -101,3 +105,64 @@ def recorder(
     confirmed = Confirmed(start_ns, boot)
     files = RecordingFiles(config, open_part, confirmed.read)
     return Fed(RecorderNode(config, files, start_ns, fingerprints, fingerprints_until_ns), files, start_ns, confirmed)
+
+
+class Disk:
+    """A disk with so much room in bytes, shared by the files on it; as on a real one, a write may be taken in part."""
+
+    def __init__(self, room: int = 10**9, error: int = errno.ENOSPC) -> None:
+        self.room, self.error = room, error
+
+    def open(self, path: Path) -> PartFile:
+        disk = self
+
+        class OnDisk(PartFile):
+            def _append(self, data: bytearray) -> int:
+                if not disk.room:
+                    raise OSError(disk.error, os.strerror(disk.error))
+                taken = super()._append(data[: disk.room])
+                disk.room -= taken
+                return taken
+
+        return OnDisk(path)
+
+
+def samples(count: int, first: int = 0) -> Iterator[Publication]:
+    """Samples of a signal, a second apart."""
+    for number in range(first, first + count):
+        sample = Sample(time_ns=number * SECOND, sequence=number, value=1.0, quality=messages.QUALITY_GOOD)
+        yield Publication(keys.key("cstr", keys.SAMPLE, "T"), sample)
+
+
+def alarm(name: str, event: str = "raised") -> Publication:
+    return Publication(keys.key("cstr", keys.ALARM, name), Alarm(time_ns=1, alarm=name, event=event))
+
+
+def received(key: str, message: Body, received_ns: int = 0, *, latched: bool = False) -> RecordedMessage:
+    """A message as a recorder receives it, at the time of its sample unless another is given."""
+    time_ns: int = getattr(message, "time_ns", 0)
+    encoded = encode(Publication(key, message))
+    return RecordedMessage(*encoded[:3], received_ns or time_ns, time_ns, latched)
+
+
+def recorded(
+    path: Path, entries: Iterable[RecordedMessage], every: int = 0, metadata: dict[str, str] | None = None
+) -> Path:
+    """A recording of these messages, flushed after each so many of them."""
+    with RecordingWriter(path, metadata or {}) as writer:
+        for number, entry in enumerate(entries, start=1):
+            writer.write(entry)
+            if every and number % every == 0:
+                writer.flush()
+    return path
+
+
+def of_others(path: Path) -> list[RecordedMessage]:
+    """Messages of a recording without the recorder's own health reports."""
+    return [entry for entry in Recording(path).messages() if not entry.key.endswith("health/recorder")]
+
+
+def sequences(path: Path) -> list[int]:
+    """Sequence numbers of the samples of a recording."""
+    found = (decode(entry.payload, entry.encoding) for entry in Recording(path).messages())
+    return [message.sequence for message in found if isinstance(message, Sample)]

@@ -7,11 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from recorder.files.ages import Ages, read_boot_clock
 from recorder.keep import DAY_NS
+from recorder.recording_files import Ages, read_boot_clock
 from tests.unit.recorder import golden
-from tests.unit.recorder.recording import SECOND, Confirmed, Fed, recorder
-from tests.unit.recorder.test_files import samples
+from tests.unit.recorder.recording import SECOND, Confirmed, Fed, recorder, samples
 
 START = golden.RECEIVED_NS
 LIMITS: dict[str, dict[str, Any]] = {"keep_files": {"keep_files": 3.0}, "keep_mb": {"keep_mb": 0.04}}
@@ -81,23 +80,6 @@ def test_of_files_on_both_sides_of_a_jump_the_oldest_by_the_confirmed_time_goes_
     assert min(-number for number in numbers) > 3
 
 
-def test_ages_continue_after_a_restart_in_the_same_boot_and_stand_still_while_the_machine_is_off(
-    tmp_path: Path,
-) -> None:
-    clock = Confirmed(1000, "first")
-    ages = Ages(tmp_path / ".ages", clock.read)
-    assert ages.update([("a", 7)]) == {"a": 0}
-    clock.now_ns = 1500
-    ages.store()
-    clock.now_ns = 1800
-    again = Ages(tmp_path / ".ages", clock.read)
-    assert again.now_ns() == 800
-    assert again.update([("a", 7), ("b", 7)]) == {"a": 0, "b": 800}
-    again.store()
-    rebooted = Ages(tmp_path / ".ages", Confirmed(3, "second").read)
-    assert rebooted.now_ns() == 800
-
-
 def test_a_new_file_of_an_old_name_is_not_as_old(tmp_path: Path) -> None:
     clock = Confirmed(0)
     ages = Ages(tmp_path / ".ages", clock.read)
@@ -130,12 +112,6 @@ def test_no_age_is_more_than_the_time_in_which_the_machine_ran(
             clock = Confirmed(span_ns, f"boot {number}")
             ages = Ages(path, clock.read)
         assert 0 <= ages.now_ns() - ages.update([("a", 1)])["a"] <= ran_ns
-
-
-def test_the_clock_since_the_machine_s_start_has_a_name_and_advances() -> None:
-    first, second = read_boot_clock(), read_boot_clock()
-    assert first.boot == second.boot
-    assert first.since_ns <= second.since_ns
 
 
 def stored_ages(path: Path, boot: str, since_ns: int) -> None:
@@ -182,7 +158,7 @@ def test_a_recording_is_as_old_as_its_completion_though_it_is_listed_later(tmp_p
 def test_without_the_identifier_of_the_boot_no_boot_is_claimed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     identifier = tmp_path / "boot_id"
     identifier.write_text("7-7\n")
-    monkeypatch.setattr("recorder.files.ages._BOOT_ID", identifier)
+    monkeypatch.setattr("recorder.recording_files._BOOT_ID", identifier)
     assert read_boot_clock().boot == "7-7"
     identifier.unlink()
     first, second = read_boot_clock(), read_boot_clock()

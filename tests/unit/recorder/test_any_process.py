@@ -1,4 +1,4 @@
-"""Recordings of any process: import, info and export keep its signals, values, units and roles."""
+"""Recordings of any process keep its signals, values, units and roles; a live one describes each of its plants."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -10,21 +10,32 @@ import pytest
 import tomli_w
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from mcap.records import Metadata
 from numpy.typing import NDArray
 
+from plant_node.config import PlantConfig
+from plant_node.record import simulate_record
+from reactorwatch.cli.diagnose import DiagnosisOptions, load_case
 from reactorwatch.cli.info import info_object, info_text
-from reactorwatch.description.find import ProcessChoice, find_process
+from reactorwatch.contract.codec import encode
 from reactorwatch.description.process import ROLES, Process, Signal
-from reactorwatch.description.read import read_process_table
+from reactorwatch.description.read import PlantProcesses, ProcessChoice, find_process, read_process_table
 from reactorwatch.errors import InputError
+from reactorwatch.process import MODELS
+from reactorwatch.process.fault import parse_fault
 from reactorwatch.records.record import Record, join_runs
 from reactorwatch.records.write import write_table
-from recorder.config import ReplayConfig
+from recorder.config import RecorderConfig, ReplayConfig
+from recorder.core import Recorder
 from recorder.files.copies import Window, cut
-from recorder.files.recording import Recording
+from recorder.files.recording import PROCESS, Recording, process_metadata, processes_in
+from recorder.recording_files import RecordingFiles
 from recorder.tools.convert import export_csv, import_csv, read_record
 from recorder.tools.inspect import inspect
+from recorder.tools.player import samples_of
 from recorder.tools.replay import open_tape
+from tests.unit.plant_node.test_plant_of_any_process import RIG
+from tests.unit.recorder.recording import received, recorded
 from tests.unit.records.test_csv_file import assert_same
 
 UNITS = ("", "degC", "bar", "l/min", "%", "m3/h", "cm3/s")
@@ -142,17 +153,14 @@ def test_cut_recordings_describe_their_processes(tanks: Path, tmp_path: Path) ->
     assert signals_of(inspect(tmp_path).processes) == expected
 
 
-def test_a_table_that_is_no_record_of_the_reactor_is_refused_with_the_cure(tanks: Path, tmp_path: Path) -> None:
-    cure = (
-        "if it is no record of the reactor, name its process with --process, or its columns with --input and --output"
-    )
-    with pytest.raises(InputError, match=rf"tanks.csv, row 1: expected a column 'qc' in the header, got .*{cure}"):
+def test_a_table_that_is_no_record_of_the_reactor_is_refused_with_the_options_that_the_command_has(
+    tanks: Path, tmp_path: Path
+) -> None:
+    cure = "if it is no record of the reactor, name its process with --process"
+    with pytest.raises(InputError, match=rf"tanks.csv, row 1: expected a column 'qc' .*{cure}, or its columns"):
         import_csv(tanks.with_suffix(".csv"), tmp_path / "x.mcap")
     assert not (tmp_path / "x.mcap").exists()
-
-
-def test_a_command_that_needs_equations_refuses_it_without_the_options_that_it_lacks(tanks: Path) -> None:
-    with pytest.raises(InputError, match=r"no record of the reactor, name its process with --process$"):
+    with pytest.raises(InputError, match=f"{cure}$"):
         read_process_table(tanks.with_suffix(".csv"), find_process())
 
 
@@ -194,16 +202,8 @@ def test_a_recording_that_nothing_describes_gives_all_its_signals_in_the_order_o
 
 def write_undescribed(path: Path, record: Record) -> None:
     """Record samples as a recorder does, which knows of no process."""
-    from reactorwatch.contract.codec import encode
-    from recorder import RecordedMessage
-    from recorder.files.writer import RecordingWriter
-    from recorder.tools.player import samples_of
-
     path.unlink(missing_ok=True)
-    with RecordingWriter(path, {"plant": "rig"}) as writer:
-        for publication in samples_of(record, "rig"):
-            encoded, time_ns = encode(publication), publication.message.time_ns
-            writer.write(RecordedMessage(encoded.key, encoded.payload, encoded.encoding, time_ns, time_ns))
+    recorded(path, (received(*item) for item in samples_of(record, "rig")), metadata={"plant": "rig"})
 
 
 def test_a_process_whose_name_no_plant_can_have_is_refused_with_the_cure(tmp_path: Path) -> None:
@@ -255,3 +255,102 @@ def test_a_signal_that_the_bus_cannot_name_is_recorded_and_not_replayed_with_the
     with pytest.raises(InputError, match=r"must not hold .*; import it with a process that gives the signal another"):
         open_tape(ReplayConfig(str(tmp_path / f"rig{suffix}"), process=choice.process))
     assert open_tape(ReplayConfig(str(tmp_path / "rig.mcap"), outputs=("y",)))[0] == ("rig",)
+
+
+START_NS = 10**18
+CATALOGUE = [make().name for make in MODELS]
+
+
+def store(process: Process) -> Process:
+    return processes_in([Metadata(PROCESS, process_metadata("unit", process))])["unit"]
+
+
+def write_samples(files: RecordingFiles, plant: str, process: str, rows: int) -> None:
+    """Write the samples of a simulated plant as a recorder of the bus does, in a new file."""
+    recorder = Recorder("site", 0)
+    files.start_file((), START_NS)
+    for item in samples_of(simulate_record(PlantConfig(process=process), rows), plant, START_NS):
+        received = recorder.on_message(encode(item)._replace(received_ns=START_NS), START_NS)
+        assert received is not None
+        files.write(received)
+
+
+@pytest.mark.parametrize("name", CATALOGUE)
+def test_stored_equations_of_the_catalogue_are_the_same_model(name: str) -> None:
+    process = find_process(name)
+    stored = store(process)
+    assert stored.model is not None
+    assert [effect.name for effect in stored.effects] == [effect.name for effect in process.effects]
+    assert stored.signals == process.signals
+    assert stored.require_model().rhs == process.require_model().rhs
+
+
+def test_given_constants_and_constant_deviations_are_stored_too(tmp_path: Path) -> None:
+    path = tmp_path / "rig.toml"
+    path.write_text(RIG, encoding="utf-8")
+    rig = find_process(path)
+    stored = store(rig)
+    assert stored.uncertain == rig.uncertain == {"a2": 0.01}
+    assert stored.require_model().parameter("a2").value == 0.62
+    assert stored.units == {**rig.units}
+    leak = parse_fault("leak1:constant:0.1", rig.effects)
+    leaking = replace(rig, equations=leak.extend(find_process("three_tanks").require_model()))
+    assert store(leaking).require_model().parameter("leak1.size").value == 0.1
+
+
+def test_equations_that_are_not_of_the_catalogue_are_left_out_and_the_signals_stay() -> None:
+    tanks = find_process("cascaded_tanks")
+    model = tanks.require_model()
+    own = replace(tanks, equations=replace(model, rhs=(2 * model.rhs[0], model.rhs[1])))
+    other = replace(tanks, equations=replace(model, name="other"))
+    for process in (own, other):
+        stored = store(process)
+        assert (stored.model, stored.signals) == (None, tanks.signals)
+
+
+def test_equations_of_a_later_version_are_left_out() -> None:
+    metadata = process_metadata("unit", find_process("cstr"))
+    for key, value in (("equations", '{"format": "reactorwatch.model.v9"}'), ("parameters", "[]")):
+        stored = processes_in([Metadata(PROCESS, {**metadata, key: value})])["unit"]
+        assert (stored.model, stored.outputs) == (None, ("C", "T"))
+
+
+def test_a_later_description_of_a_plant_is_not_used() -> None:
+    first, later = (Metadata(PROCESS, process_metadata("unit", find_process(name))) for name in CATALOGUE[:2])
+    assert processes_in([first, later])["unit"].name == CATALOGUE[0]
+    assert processes_in([later, first])["unit"].name == CATALOGUE[1]
+
+
+def test_each_file_describes_the_plants_with_samples_in_it_and_a_copy_keeps_that(tmp_path: Path) -> None:
+    config = RecorderConfig(plant="site", out=str(tmp_path), processes={"*": "cstr", "north": "three_tanks"})
+    with RecordingFiles(config) as files:
+        for plant, process in (("north", "three_tanks"), ("south", "cstr")):
+            write_samples(files, plant, process, 20)
+    written = sorted(tmp_path.glob("*.mcap"))
+    names = [{plant: item.name for plant, item in inspect(file).processes.items()} for file in written]
+    assert sorted(names, key=str) == [{"north": "three_tanks"}, {"south": "cstr"}]
+    copy = tmp_path / "cut.mcap"
+    cut(written, copy, Window((0, 2**62)), {})
+    assert {plant: item.name for plant, item in inspect(copy).processes.items()} == names[0] | names[1]
+
+
+def test_without_equations_a_recording_is_not_diagnosed_and_the_line_states_the_cure(tmp_path: Path) -> None:
+    path, bare = tmp_path / "bare.mcap", tmp_path / "bare.toml"
+    signals = RIG[RIG.index("[[signals]]") :]
+    bare.write_text(f'name = "rig"\n{signals}', encoding="utf-8")
+    with RecordingFiles(RecorderConfig(plant="tanks", out=str(path), processes={"tanks": str(bare)})) as files:
+        write_samples(files, "tanks", "three_tanks", 30)
+    with pytest.raises(InputError, match=r"^process 'rig': must have equations for this, got none; name those of"):
+        load_case(path, DiagnosisOptions())
+
+
+def test_a_plant_s_own_entry_goes_before_patterns() -> None:
+    processes = PlantProcesses({"north_*": "cstr", "north_2": "three_tanks"})
+    names = [process and process.name for process in map(processes.find, ("north_1", "north_2", "south"))]
+    assert names == ["cstr", "three_tanks", None]
+
+
+def test_an_unknown_process_is_refused_before_anything_is_written(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"^unknown process 'three_tank'; did you mean 'three_tanks'\?"):
+        RecordingFiles(RecorderConfig(plant="x", out=str(tmp_path / "x.mcap"), processes={"x": "three_tank"}))
+    assert not list(tmp_path.iterdir())

@@ -1,8 +1,8 @@
-"""The files of a recorder: one after the other, each of which opens by itself; what is kept, what is deleted."""
+"""The files of a recorder: each opens by itself; what is kept, deleted and recovered, and the black box."""
 
 import os
 import tomllib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -12,31 +12,19 @@ from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Publication, decode, encode
 from reactorwatch.errors import InputError
 from reactorwatch.version import version
-from recorder import RecordedMessage
+from recorder.config import RecorderConfig
+from recorder.core import ReceivedMessage, Recorder
 from recorder.files.reader import Reader
 from recorder.files.recording import Recording
 from recorder.files.writer import RecordingWriter
-from recorder.recording_files import BackgroundTasks
+from recorder.keep import AlarmInterval
+from recorder.recording_files import RecordingFiles, free_bytes
 from recorder.tools.convert import read_record
 from tests.unit.recorder import golden
-from tests.unit.recorder.recording import MINUTE, SECOND, Fed, recorder
+from tests.unit.recorder.recording import MINUTE, SECOND, Confirmed, Fed, alarm, of_others, recorder, samples, sequences
 
 START = golden.RECEIVED_NS
 ALL = [encode(publication) for publication in golden.publications()]
-
-
-def of_others(path: Path) -> list[RecordedMessage]:
-    return [entry for entry in Recording(path).messages() if not entry.key.endswith("health/recorder")]
-
-
-def alarm(name: str, event: str = "raised") -> Publication:
-    return Publication(keys.key("cstr", keys.ALARM, name), messages.Alarm(time_ns=1, alarm=name, event=event))
-
-
-def samples(count: int, first: int = 0) -> Iterator[Publication]:
-    for number in range(first, first + count):
-        sample = messages.Sample(time_ns=number * SECOND, sequence=number, value=1.0, quality=messages.QUALITY_GOOD)
-        yield Publication(keys.key("cstr", keys.SAMPLE, "T"), sample)
 
 
 def test_files_follow_each_other_by_age_and_hold_everything_between_them(tmp_path: Path) -> None:
@@ -118,11 +106,6 @@ def test_files_that_overlap_in_time_are_read_together_in_order_of_receipt(tmp_pa
     times = [entry.log_time_ns for entry in of_others(tmp_path)]
     assert times == sorted(times)
     assert len(times) == 40
-
-
-def test_a_folder_without_recordings_is_reported_as_such(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"holds no recording \(\.mcap\)"):
-        Recording(tmp_path).messages()
 
 
 def test_the_oldest_are_deleted_and_never_the_one_being_written_nor_a_black_box(tmp_path: Path) -> None:
@@ -211,12 +194,7 @@ def test_the_next_start_recovers_what_a_kill_left_and_resumes_in_a_new_file(tmp_
     assert not list(tmp_path.glob("*.part"))
     first, _second = Recording(tmp_path).files
     assert first.name == part.name.removesuffix(".part")
-    sequences = [
-        message.sequence
-        for entry in of_others(tmp_path)
-        if isinstance(message := decode(entry.payload, entry.encoding), messages.Sample)
-    ]
-    lost = sorted(set(range(150)) - set(sequences))
+    lost = sorted(set(range(150)) - set(sequences(tmp_path)))
     assert lost == list(range(100 - len(lost), 100))  # the last before the kill, and nothing else
     assert len(lost) <= 10  # a second
     last = [entry.log_time_ns for entry in of_others(first)][-1]
@@ -274,7 +252,7 @@ def test_background_tasks_that_run_after_the_stop_delete_no_more_than_the_limits
 ) -> None:
     """As a machine does that is busy with other things."""
     late: list[Callable[[], None]] = []
-    monkeypatch.setattr(BackgroundTasks, "submit", lambda _self, _name, task: late.append(task))
+    monkeypatch.setattr(RecordingFiles, "_submit", lambda _self, _name, task: late.append(task))
     fed = recorder(tmp_path / "run.mcap", START, rotate_min=1.0, keep_files=3.0, black_box_min=0.0)
     fed.receive(samples(130), SECOND)
     fed.stop()
@@ -295,14 +273,7 @@ def raising(folder: Path) -> Fed:
 
 def boxed(folder: Path) -> list[list[int]]:
     """The numbers of the samples in each file of the black box."""
-    return [
-        [
-            message.sequence
-            for entry in of_others(path)
-            if isinstance(message := decode(entry.payload, entry.encoding), messages.Sample)
-        ]
-        for path in sorted((folder / "black-box").glob("*.mcap"))
-    ]
+    return [sequences(path) for path in sorted((folder / "black-box").glob("*.mcap"))]
 
 
 def test_a_segment_under_way_when_the_recorder_is_killed_resumes_with_the_next_start(tmp_path: Path) -> None:
@@ -377,3 +348,83 @@ def test_a_copy_that_a_kill_left_half_made_is_removed(tmp_path: Path) -> None:
     (tmp_path / f".run.mcap.{os.getpid()}.tmp.part").write_bytes(b"x")
     recorder(tmp_path / "run.mcap", START).stop()
     assert [path.name for path in tmp_path.iterdir()] == ["run.mcap"]
+
+
+RUN = AlarmInterval(START, START + SECOND, START, "ewma/T")
+
+
+def received(count: int) -> list[ReceivedMessage]:
+    """Samples as they come to the files."""
+    core, found = Recorder("cstr", 0), list[ReceivedMessage]()
+    for number, item in enumerate(samples(count)):
+        message = core.on_message(encode(item), START + number * SECOND)
+        assert message is not None
+        found.append(message)
+    return found
+
+
+def files(folder: Path, name: str = "run.mcap", **settings: object) -> RecordingFiles:
+    """The files of a recorder."""
+    config = RecorderConfig(out=str(folder / name), **settings)  # type: ignore[arg-type]
+    return RecordingFiles(config, read_clock=Confirmed(0).read)
+
+
+def test_a_file_is_as_old_as_its_last_message_and_has_a_size_while_it_is_written(tmp_path: Path) -> None:
+    written = files(tmp_path)
+    assert (written.path, written.size_bytes, written.abandon()) == (None, 0, 0)
+    with written:
+        path = written.start_file([], START)
+        assert (written.path, written.size_bytes > 0) == (path, True)
+        for message in received(3):
+            written.write(message)
+        started_bytes = written.size_bytes
+        written.flush()
+        assert written.size_bytes > started_bytes
+    assert (written.path, written.size_bytes) == (None, 0)
+    assert path.stat().st_mtime_ns == START + 2 * SECOND
+    written.complete()
+    assert [stored.sequence for stored in Reader(path)] == [0, 1, 2]
+
+
+def test_black_boxes_of_one_alarm_and_second_are_numbered(tmp_path: Path) -> None:
+    with files(tmp_path) as written:
+        written.start_file([], START)
+        written.write(received(1)[0])
+        written.flush()
+        for _ in range(3):
+            written.save_black_box(RUN)
+    names = sorted((path.name for path in (tmp_path / "black-box").iterdir()), key=len)
+    moment = names[0].removeprefix("run-").removesuffix("-ewma-T.mcap")
+    assert len(moment) == len("20260101T000000Z")
+    assert sorted(names) == sorted(f"run-{moment}-ewma-T{end}.mcap" for end in ("", "-2", "-3"))
+
+
+def test_work_in_the_background_is_done_in_its_order_though_some_of_it_fails(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    done = list[str]()
+
+    def fail_first(part: Path) -> None:
+        done.append(part.name)
+        if len(done) == 1:
+            raise InputError("there is no file")
+
+    monkeypatch.setattr("recorder.recording_files.repair", fail_first)
+    for number in range(3):
+        (tmp_path / f"run-{number + 2}.mcap.part").write_bytes(b"x")
+    with files(tmp_path) as written:
+        written.start_file([], START)
+    assert done == [f"run-{number + 2}.mcap.part" for number in range(3)]
+    assert f"recovering {tmp_path / done[0]} failed" in capsys.readouterr().out
+
+
+def test_the_free_space_of_a_folder_that_does_not_exist_is_that_of_its_parent(tmp_path: Path) -> None:
+    assert free_bytes(tmp_path / "none" / "deeper") > 0
+
+
+def test_a_folder_that_does_not_exist_is_made_and_none_of_the_name_of_a_table(tmp_path: Path) -> None:
+    files(tmp_path, "new")
+    assert (tmp_path / "new").is_dir()
+    with pytest.raises(InputError, match="does not exist"):
+        files(tmp_path, "run.csv")
+    assert not (tmp_path / "run.csv").exists()

@@ -1,5 +1,7 @@
-"""The recorder as a node on a bus within the process."""
+"""The recorder as a node on a bus within the process, and its settings."""
 
+import math
+import sys
 import threading
 import time
 from collections.abc import Callable
@@ -10,9 +12,13 @@ import pytest
 from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
 from reactorwatch.contract.codec import Encoded, decode, encode
+from reactorwatch.errors import InputError
+from reactorwatch.runtime.config import section
 from reactorwatch.runtime.event_loop import EventLoop, StopSignal
+from reactorwatch.runtime.node_main import main
 from recorder import RecordedMessage
-from recorder.config import RecorderConfig
+from recorder.__main__ import run
+from recorder.config import RecorderConfig, ReplayConfig
 from recorder.files.recording import Recording
 from recorder.node import RecorderNode
 from recorder.recording_files import RecordingFiles
@@ -82,14 +88,6 @@ def test_it_reports_at_once_and_then_every_period_and_flushes_between(tmp_path: 
     assert grown == [101, 103, 105, 107, 109, 111]
 
 
-def test_a_command_that_is_not_its_own_is_refused(tmp_path: Path) -> None:
-    node, writer = node_on(tmp_path / "run.mcap")
-    with writer:
-        reply, published = node.on_command(Encoded("reactor/cstr/command/x", b"", ""), 0)
-    assert not reply.accepted
-    assert published == []
-
-
 def test_the_file_is_closed_when_the_loop_ends_by_an_exception(tmp_path: Path) -> None:
     class Broken(MemoryBus):
         def subscribe(self, key_expression: str, handler: Callable[[Encoded], None], **_: object) -> None:
@@ -107,3 +105,56 @@ def test_the_file_is_closed_when_the_loop_ends_by_an_exception(tmp_path: Path) -
     with pytest.raises(ConnectionError), writer:
         loop.run()
     assert next(Recording(tmp_path / "run.mcap").messages()).payload == message.payload
+
+
+def test_the_defaults_record_everything() -> None:
+    config = section(RecorderConfig, "recorder", {}, {})
+    assert (config.plant, config.key_expression, config.health_period_s) == ("cstr", "reactor/**", 5.0)
+
+
+@pytest.mark.parametrize(
+    ("values", "said"),
+    [
+        ({"plant": "a/b"}, "plant name must be"),
+        ({"health_period_s": 0.0}, "health_period_s must be positive and finite, got 0.0"),
+        ({"flush_period_s": math.inf}, "flush_period_s must be positive and finite, got inf"),
+        ({"flush_period_s": 1.5}, "flush_period_s must be at most 1, got 1.5"),
+        ({"fsync": "often"}, "fsync: unknown word 'often' .valid: never, chunk, second"),
+        ({"rotate_min": 0.0}, "rotate_min must be positive, or inf, got 0.0"),
+        ({"keep_mb": math.nan}, "keep_mb must be positive, or inf, got nan"),
+        ({"keep_files": 0.0}, "keep_files must be at least 1, or inf, got 0.0"),
+        ({"black_box_min": -1.0}, "black_box_min must be finite and not negative, got -1.0"),
+        ({"most_keys": 10}, r"most_keys must be in \[100, 60000\], got 10"),
+        ({"most_keys": 60_001}, r"most_keys must be in \[100, 60000\], got 60001"),
+        ({"period": 1}, "unknown key 'period'"),
+    ],
+)
+def test_an_impossible_setting_is_reported_in_one_line(values: dict[str, object], said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        section(RecorderConfig, "recorder", {"recorder": values}, {})
+
+
+def test_a_replay_may_be_as_fast_as_it_goes_but_not_stand_still() -> None:
+    assert section(ReplayConfig, "replay", {}, {"file": "x.csv", "rate": math.inf}).rate == math.inf
+    with pytest.raises(InputError, match=r"rate must be positive, got 0\.0"):
+        section(ReplayConfig, "replay", {}, {"file": "x.csv", "rate": 0.0})
+    with pytest.raises(InputError, match="from_min must be before to_min, got 5 and 5"):
+        section(ReplayConfig, "replay", {}, {"file": "x.csv", "from_min": 5.0, "to_min": 5.0})
+    with pytest.raises(InputError, match="file"):
+        section(ReplayConfig, "replay", {}, {})
+
+
+def test_the_process_ends_with_2_and_one_line_before_it_looks_for_a_router(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settings = tmp_path / "settings.toml"
+    settings.write_text(f'[recorder]\nout = "{tmp_path}/none/run.mcap"\n')
+    monkeypatch.setattr(sys, "argv", ["recorder", str(settings)])
+    assert main("recorder", "recorder", RecorderConfig, run) == 2
+    assert (
+        capsys.readouterr().err
+        == f"recorder: recording {tmp_path}/none/run.mcap: the folder {tmp_path}/none does not exist\n"
+    )
+    monkeypatch.setattr(sys, "argv", ["recorder", "a", "b"])
+    assert main("recorder", "recorder", RecorderConfig, run) == 2
+    assert "usage: python -m recorder [settings.toml]" in capsys.readouterr().err

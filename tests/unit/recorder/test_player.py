@@ -1,16 +1,18 @@
-"""Playing back: what goes out, and when."""
+"""Playing back: what is published, and when; from a given time on it starts with the active alarms."""
 
 import math
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import numpy as np
 import pytest
 
 from reactorwatch.contract import keys
 from reactorwatch.contract import messages_pb2 as messages
-from reactorwatch.contract.codec import Encoded, Publication, encode
+from reactorwatch.contract.codec import Publication, encode
 from reactorwatch.records.record import NEVER_NS, Record
 from recorder import RecordedMessage
+from recorder.keep import LATCHED_KINDS
 from recorder.tools.player import BATCH, EVERYTHING, Player, filter_playable, filter_time, samples_of
 from tests.unit.recorder import golden
 
@@ -45,7 +47,10 @@ def played(player: Player, start_ns: int = 0) -> list[tuple[float, float]]:
     return out
 
 
-@pytest.mark.parametrize(("rate", "clock"), [(1.0, [7, 8, 10, 17]), (2.0, [7, 7.5, 8.5, 12]), (math.inf, [7] * 4)])
+@pytest.mark.parametrize(
+    ("rate", "clock"),
+    [(1.0, [7, 8, 10, 17]), (2.0, [7, 7.5, 8.5, 12]), (0.1, [7, 17, 37, 107]), (math.inf, [7] * 4)],
+)
 def test_samples_go_out_at_the_pace_of_their_times(rate: float, clock: list[float]) -> None:
     assert played(Player(at(100, 101, 103, 110), rate), 7 * SECOND) == list(
         zip(clock, [100, 101, 103, 110], strict=True)
@@ -129,10 +134,6 @@ def test_a_row_in_which_nothing_was_measured_has_bad_quality() -> None:
     assert (body.quality, math.isnan(body.value)) == (messages.QUALITY_BAD, True)
 
 
-def test_a_slow_play_takes_ten_times_as_long() -> None:
-    assert played(Player(at(0, 1, 3), 0.1)) == [(0, 0), (10, 1), (30, 3)]
-
-
 def test_a_stretch_is_played_with_both_its_ends_at_the_times_of_its_samples() -> None:
     tape = at(0, 10, 11, 14, 15, 90)
     player = Player(lambda: filter_time(tape(), 10 * SECOND, 15 * SECOND), 1.0)
@@ -205,7 +206,95 @@ def test_a_step_while_it_plays_publishes_nothing_and_changes_nothing() -> None:
     assert played(player) == [(0, 0), (1, 1)]
 
 
-def test_it_subscribes_to_nothing_and_publishes_nothing_at_the_end() -> None:
-    player = Player(at(1), 1.0)
-    assert player.on_message(Encoded("reactor/x/command/y", b"", ""), 0) == []
-    assert player.on_stop(0) == []
+SECOND_NS = 1_000_000_000
+FROM_NS = 100 * SECOND_NS
+
+
+def sampled(second: float) -> Publication:
+    number = int(second)
+    return Publication(
+        keys.key("cstr", keys.SAMPLE, "T"),
+        messages.Sample(time_ns=int(second * SECOND_NS), sequence=number, value=1.0, quality=messages.QUALITY_GOOD),
+    )
+
+
+def alarmed(second: float, name: str, state: Any) -> Publication:
+    return Publication(
+        keys.key("cstr", keys.ALARM, name), messages.Alarm(time_ns=int(second * SECOND_NS), alarm=name, state=state)
+    )
+
+
+STANDING = sorted({*messages.AlarmState.values()} - {messages.ALARM_STATE_NORMAL, messages.ALARM_STATE_UNSPECIFIED})
+
+
+def recorded_tape() -> Iterator[Publication]:
+    for second in range(200):
+        yield sampled(second)
+        if second == 40:
+            yield from (alarmed(second, f"a{state}", state) for state in STANDING)
+            yield alarmed(second, "was", messages.ALARM_STATE_UNACKNOWLEDGED)
+            yield alarmed(second, "changed", messages.ALARM_STATE_UNACKNOWLEDGED)
+        if second == 60:
+            yield alarmed(second, "was", messages.ALARM_STATE_NORMAL)
+            yield alarmed(second, "changed", messages.ALARM_STATE_ACKNOWLEDGED)
+        if second == 150:
+            yield alarmed(second, "later", messages.ALARM_STATE_UNACKNOWLEDGED)
+
+
+def test_the_newest_message_of_each_standing_alarm_comes_before_the_first_sample() -> None:
+    played = list(filter_time(recorded_tape(), FROM_NS, 2 * FROM_NS))
+    names = [item.message.alarm for item in played[: len(STANDING) + 1] if isinstance(item.message, messages.Alarm)]
+    assert sorted(names) == sorted([*(f"a{state}" for state in STANDING), "changed"])
+    states = {
+        item.message.state for item in played if isinstance(item.message, messages.Alarm) and "changed" in item.key
+    }
+    assert states == {messages.ALARM_STATE_ACKNOWLEDGED}
+    rest = [item for item in played[len(names) :] if not item.key.endswith("later")]
+    assert rest == [sampled(second) for second in range(100, 200)]
+
+
+def test_from_the_start_nothing_is_published_before_it() -> None:
+    assert list(filter_time(recorded_tape(), 0, 2 * FROM_NS)) == list(recorded_tape())
+
+
+@pytest.mark.parametrize("rate", [1.0, 60.0])
+def test_standing_alarms_are_due_with_the_first_sample(rate: float) -> None:
+    player = Player(lambda: filter_time(recorded_tape(), FROM_NS, 2 * FROM_NS), rate)
+    first = player.on_tick(0)
+    assert len(first) == len(STANDING) + 2
+    assert first[-1] == sampled(100)
+    assert player.next_tick_ns() == round(SECOND_NS / rate)
+
+
+@pytest.mark.parametrize("kind", LATCHED_KINDS)
+def test_latched_messages_of_every_kind_are_due_with_the_first_sample(kind: str) -> None:
+    latched = Publication(keys.key("cstr", kind, "x"), LATCHED_KINDS[kind](time_ns=0))  # type: ignore[arg-type]
+    said = list[float]()
+    player = Player(lambda: iter([latched, sampled(18_000), sampled(18_001)]), 1.0, on_wait=said.append)
+    assert player.on_tick(0) == [latched, sampled(18_000)]
+    assert player.next_tick_ns() == SECOND_NS
+    assert not said
+
+
+@pytest.mark.parametrize(
+    ("seconds", "rate", "waits"),
+    [
+        ([0, 1, 2, 3], 1.0, []),
+        ([0, 1, 2, 3602], 1.0, [3600.0]),
+        ([0, 1, 2, 3602], 60.0, []),  # a minute
+        ([0, 1, 2, 36002], 60.0, [600.0]),
+        ([0, 1, 2, 63], 1.0, [61.0]),
+        ([0, 90, 180, 270], 1.0, [90.0]),  # the first wait: what is usual is not known yet
+        ([0, 1, 2, 3602], float("inf"), []),
+    ],
+)
+def test_a_wait_of_more_than_a_minute_for_a_jump_of_the_clock_is_reported(
+    seconds: list[float], rate: float, waits: list[float]
+) -> None:
+    said = list[float]()
+    player = Player(lambda: iter([sampled(second) for second in seconds]), rate, on_wait=said.append)
+    now_ns = 0
+    while not player.finished:
+        player.on_tick(now_ns)
+        now_ns = max(now_ns, player.next_tick_ns())
+    assert said == pytest.approx(waits)

@@ -8,7 +8,7 @@ from mcap.records import Channel, Chunk, Metadata
 from reactorwatch.errors import InputError
 from recorder.files.index import LATEST_NS
 from recorder.files.reader import Damage, Reader, read_start
-from tests.unit.recorder.test_chunk_data import DESCRIBED, KEY, bytes_of, chunk, message, recording
+from tests.unit.recorder.mcap_bytes import DESCRIBED, KEY, bytes_of, chunk, message, recording
 
 FIRST = chunk(DESCRIBED + message(1) + message(4), first_ns=1, last_ns=4)
 SECOND = chunk(message(5) + message(9), first_ns=5, last_ns=9)
@@ -27,11 +27,6 @@ def read(path: Path, content: bytes, *, tolerant: bool = True) -> tuple[list[int
 @pytest.fixture
 def path(tmp_path: Path) -> Path:
     return tmp_path / "run.mcap"
-
-
-@pytest.mark.parametrize("tolerant", [True, False])
-def test_a_whole_file_is_read_without_damage(path: Path, *, tolerant: bool) -> None:
-    assert read(path, WHOLE, tolerant=tolerant) == ([1, 4, 5, 9], [])
 
 
 def test_a_file_whose_beginning_is_damaged_is_read_from_its_first_chunk(path: Path) -> None:
@@ -108,13 +103,6 @@ def test_a_damaged_chunk_is_named_by_its_byte_and_the_others_are_read(path: Path
     assert damage.endswith(f") at byte {HEADER_END}")
     with pytest.raises(InputError, match=f"the chunk at byte {HEADER_END} cannot be read"):
         list(Reader(path))
-
-
-def test_where_a_length_is_damaged_the_next_chunk_is_found(path: Path) -> None:
-    content = WHOLE[: HEADER_END + 1] + b"\xff" * 8 + WHOLE[HEADER_END + 9 :]
-    assert read(path, content) == ([5, 9], [f"{FIRST_END - HEADER_END} bytes at byte {HEADER_END}"])
-    with pytest.raises(InputError, match=f"at byte {HEADER_END}"):
-        read(path, content, tolerant=False)
 
 
 @pytest.mark.parametrize("lost", [1, 20, 37])

@@ -1,25 +1,24 @@
-"""Recovery of a damaged recording: all before the damage, all after it, and never a wrong message."""
+"""Recovery of a damaged recording of any program: all before the damage, all after it, and never a wrong message."""
 
-import io
 import struct
 from collections import Counter
 from pathlib import Path
 
 import pytest
-from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
 from mcap.reader import make_reader
-from mcap.records import Chunk
 from mcap.writer import CompressionType, Writer
-from mcap_protobuf.decoder import DecoderFactory
 
+from reactorwatch.contract.codec import Publication, encode
+from reactorwatch.contract.messages_pb2 import QUALITY_GOOD, Sample
 from reactorwatch.errors import InputError
-from recorder import RecordedMessage, StoredMessage
-from recorder.files.copies import RecoveryResult, recover
-from recorder.files.reader import Reader, metadata_records
+from recorder import RecordedMessage
+from recorder.files.copies import RecoveryResult, Window, cut, recover
+from recorder.files.index import LATEST_NS
+from recorder.files.reader import Damage, metadata_records
 from recorder.files.recording import Recording
-from recorder.files.writer import RecordingWriter
 from tests.unit.recorder import golden
+from tests.unit.recorder.recording import MINUTE, recorded
 
 ENTRIES = list(golden.entries())[:90]
 CHUNK = 30
@@ -29,12 +28,7 @@ CHUNK = 30
 def whole(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     """A recording of three chunks."""
     path = tmp_path_factory.mktemp("whole") / "run.mcap"
-    with RecordingWriter(path, {"plant": "cstr", "seed": "3"}) as writer:
-        for number, entry in enumerate(ENTRIES, start=1):
-            writer.write(entry)
-            if number % CHUNK == 0:
-                writer.flush()
-    return path.read_bytes()
+    return recorded(path, ENTRIES, CHUNK, {"plant": "cstr", "seed": "3"}).read_bytes()
 
 
 def records(content: bytes) -> list[tuple[int, int, int]]:
@@ -125,19 +119,6 @@ def test_a_byte_that_is_wrong_costs_one_chunk_at_most_and_no_message_is_altered(
         assert kept == ENTRIES or (kept in may_be_left and saved.losses), place
 
 
-def test_without_its_index_nothing_is_missing(tmp_path: Path, whole: bytes) -> None:
-    summary = next(end for opcode, _, end in records(whole) if opcode == Opcode.DATA_END)
-    kept, saved = recovered(tmp_path, whole[:summary])
-    assert kept == ENTRIES
-    assert saved.messages == len(ENTRIES)
-
-
-def test_saved_messages_are_reported_by_topic_and_time(tmp_path: Path, whole: bytes) -> None:
-    _, saved = recovered(tmp_path, whole[: chunks(whole)[2][0]])
-    assert saved.topics == Counter(entry.key for entry in ENTRIES[: 2 * CHUNK])
-    assert (saved.first_ns, saved.last_ns) == (ENTRIES[0].log_time_ns, ENTRIES[2 * CHUNK - 1].log_time_ns)
-
-
 def test_a_recovered_file_states_its_origin_and_what_is_missing(tmp_path: Path, whole: bytes) -> None:
     recovered(tmp_path, whole[:-1])
     metadata = Recording(tmp_path / "out.mcap").metadata
@@ -151,13 +132,6 @@ def test_a_whole_file_is_recovered_to_the_same_messages(tmp_path: Path, whole: b
     kept, saved = recovered(tmp_path, whole)
     assert kept == ENTRIES
     assert saved.losses == ""
-
-
-def test_other_software_reads_what_was_recovered(tmp_path: Path, whole: bytes) -> None:
-    recovered(tmp_path, whole[: chunks(whole)[1][1]])
-    with (tmp_path / "out.mcap").open("rb") as stream:
-        reader = make_reader(stream, validate_crcs=True, decoder_factories=[DecoderFactory()])
-        assert len(list(reader.iter_decoded_messages())) == 2 * CHUNK
 
 
 @pytest.mark.parametrize(
@@ -223,34 +197,104 @@ def test_files_of_other_programs_are_recovered_with_their_schemas_and_metadata(
     assert metadata["rosbag2"] == {"ROS_DISTRO": "jazzy"}
 
 
-def test_messages_without_a_description_of_their_channel_are_counted(tmp_path: Path, whole: bytes) -> None:
-    """A file of another program, which describes its channels in the first chunk alone; that chunk is damaged."""
-    path = tmp_path / "other.mcap"
+def test_the_losses_of_a_recovery_are_named_up_to_five_places() -> None:
+    damages = tuple(Damage(at, "a chunk") for at in range(7))
+    assert RecoveryResult(1, 1, 1, {}, (), 0).losses == ""
+    assert RecoveryResult(1, 1, 1, {}, damages[:2], 3).losses == (
+        "a chunk at byte 0; a chunk at byte 1; 3 messages of channels that are described nowhere"
+    )
+    assert "more places" not in RecoveryResult(1, 1, 1, {}, damages[:5], 0).losses
+    assert RecoveryResult(1, 1, 1, {}, damages, 0).losses.endswith("a chunk at byte 4; 2 more places")
+
+
+def test_a_recovery_that_lost_nothing_but_the_end_is_only_truncated() -> None:
+    end, chunk = Damage(9, "cut off", is_end=True), Damage(3, "a chunk")
+    for damages, orphans, expected in (
+        ((), 0, True), ((end,), 0, True), ((chunk, end), 0, False), ((end,), 1, False),
+    ):  # fmt: skip
+        assert RecoveryResult(1, 1, 1, {}, damages, orphans).is_only_truncated is expected
+
+
+def test_a_recovery_counts_topics_and_times_and_dates_the_file_by_its_last_message(tmp_path: Path) -> None:
+    source, out = recorded(tmp_path / "run.mcap", ENTRIES[:50]), tmp_path / "out.mcap"
+    saved = recover(source, out)
+    times = [entry.log_time_ns for entry in ENTRIES[:50]]
+    assert (saved.messages, saved.first_ns, saved.last_ns) == (50, times[0], times[-1])
+    assert saved.topics == Counter(entry.key for entry in ENTRIES[:50])
+    assert out.stat().st_mtime_ns == times[-1]
+    assert [record.name for record in metadata_records(out)] == ["reactorwatch"]
+
+
+CALIBRATION = {"sensor": "T", "offset": "0.2"}
+PICTURE = b"\x89PNG" + bytes(100_000)
+
+Parts = tuple[str, dict[str, dict[str, str]], dict[str, bytes], int]
+
+
+def foreign(path: Path, profile: str = "ros2", minute: int = 0, notes: str = "") -> Path:
+    """A recording as another program writes it."""
     with path.open("wb") as stream:
-        writer = Writer(stream)
-        writer.start()
-        channels = [writer.register_channel(f"/{name}", "json", 0) for name in "ab"]
-        for number in range(20):
-            writer.add_message(channels[0], number, b"{}", number)
-        writer.flush()  # type: ignore[no-untyped-call]
-        channels.append(writer.register_channel("/c", "json", 0))
-        for number in range(20, 40):
-            writer.add_message(channels[number % 2 * 2], number, b"{}", number)
-        writer.flush()  # type: ignore[no-untyped-call]
-    content = path.read_bytes()
-    start, end = chunks(content)[0]
-    path.write_bytes(content[: end - 10] + bytes(10) + content[end:])
-    saved = recover(path, tmp_path / "out.mcap")
-    assert (saved.topics, saved.orphans) == ({"/c": 10}, 10)
-    assert "10 messages of channels that are described nowhere" in saved.losses
-    assert Chunk.read(ReadDataStream(io.BytesIO(content[start + 9 : end]))).message_end_time == 19
+        writer = Writer(stream, compression=CompressionType.ZSTD)
+        writer.start(profile=profile, library="another program")
+        writer.add_metadata("calibration", CALIBRATION)
+        if notes:
+            writer.add_metadata("notes", {"text": notes})
+        channel = writer.register_channel("reactor/cstr/sample/T", "protobuf", 0)
+        for row in range(10):
+            time_ns = 10**18 + (10 * minute + row) * MINUTE
+            body = encode(
+                Publication("reactor/cstr/sample/T", Sample(time_ns=time_ns, value=440.0, quality=QUALITY_GOOD))
+            )
+            writer.add_message(channel, time_ns, body.payload, time_ns)
+        writer.add_attachment(10**18, 10**18, "plant.png", "image/png", PICTURE)
+        writer.finish()  # type: ignore[no-untyped-call]
+    return path
 
 
-def test_a_pass_over_a_stretch_of_time_reads_only_the_chunks_in_it(tmp_path: Path, whole: bytes) -> None:
-    path = tmp_path / "run.mcap"
-    _, end = chunks(whole)[0]
-    path.write_bytes(whole[: end - 10] + bytes(10) + whole[end:])
-    reader = Reader(path, ENTRIES[CHUNK].log_time_ns, ENTRIES[2 * CHUNK - 1].log_time_ns)
-    found: list[StoredMessage] = list(reader)
-    assert [stored.payload for stored in found] == [entry.payload for entry in ENTRIES[CHUNK : 2 * CHUNK]]
-    assert not reader.damages
+def parts(path: Path) -> Parts:
+    """The profile, the metadata of others, the attachments of a file, and how many of them its statistics say."""
+    with path.open("rb") as stream:
+        reader = make_reader(stream, validate_crcs=True)
+        profile, statistics = reader.get_header().profile, reader.get_summary().statistics  # type: ignore[union-attr]
+        assert statistics is not None
+        metadata = {item.name: item.metadata for item in reader.iter_metadata() if item.name != "reactorwatch"}
+        attachments = {item.name: item.data for item in reader.iter_attachments()}
+    return profile, metadata, attachments, statistics.attachment_count
+
+
+def all_parts(notes: str = "") -> Parts:
+    metadata = {"calibration": CALIBRATION, **({"notes": {"text": notes}} if notes else {})}
+    return "ros2", metadata, {"plant.png": PICTURE}, 1
+
+
+def test_a_cut_keeps_them_equal_ones_once_and_of_several_profiles_none(
+    tmp_path: Path,
+) -> None:
+    source, new, always = foreign(tmp_path / "a.mcap", notes="a"), tmp_path / "new.mcap", Window((0, LATEST_NS))
+    cut([source], new, always, {})
+    assert parts(new) == all_parts("a") == parts(source)
+    cut([foreign(tmp_path / "c.mcap"), foreign(tmp_path / "b.mcap", minute=1, notes="b")], new, always, {})
+    assert parts(new) == all_parts("b")
+    cut([source, foreign(tmp_path / "d.mcap", "x", 1)], new, always, {})
+    assert parts(new)[0] == ""
+
+
+@pytest.mark.parametrize("cut_off", [0, 1, 50])
+def test_a_recovery_keeps_them(tmp_path: Path, cut_off: int) -> None:
+    source = foreign(tmp_path / "a.mcap")
+    content = source.read_bytes()
+    source.write_bytes(content[: len(content) - cut_off])
+    recover(source, tmp_path / "new.mcap")
+    profile, metadata, attachments, count = parts(tmp_path / "new.mcap")
+    assert (profile, metadata["calibration"], attachments, count) == ("ros2", CALIBRATION, {"plant.png": PICTURE}, 1)
+    assert ("recovered" in metadata) == bool(cut_off)
+
+
+def test_a_damaged_attachment_is_reported_and_left_out(tmp_path: Path) -> None:
+    source = foreign(tmp_path / "a.mcap")
+    content = bytearray(source.read_bytes())
+    content[content.index(PICTURE) + 50_000] ^= 1
+    source.write_bytes(content)
+    saved = recover(source, tmp_path / "new.mcap")
+    assert "an attachment" in saved.losses
+    assert parts(tmp_path / "new.mcap")[2:] == ({}, 0)

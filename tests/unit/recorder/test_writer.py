@@ -1,13 +1,20 @@
-"""A full disk at any byte: no message reported as saved is lost, none is there twice, and flushing resumes."""
+"""The file being written: a full disk at any byte loses no message that is reported as saved, and none is there twice.
 
+A full disk at any byte: no message reported as saved is lost, none is there twice, and flushing resumes.
+
+Drained bytes are in the file, synced ones on the disk, and the lock lasts as long as the recorder.
+"""
+
+import contextlib
 import errno
+import fcntl
 import os
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
-from mcap.reader import make_reader
 from mcap.records import Attachment
 
 from reactorwatch.contract.codec import encoding_of
@@ -15,33 +22,23 @@ from reactorwatch.contract.messages_pb2 import QUALITY_GOOD, Sample
 from reactorwatch.errors import InputError
 from recorder import RecordedMessage
 from recorder.files.copies import recover
-from recorder.files.part_file import PartFile
-from recorder.files.reader import Reader, StoredChannel, metadata_records
+from recorder.files.reader import Reader, metadata_records
 from recorder.files.recording import Recording
-from recorder.files.writer import RecordingWriter, WriteError, check_free
+from recorder.files.writer import (
+    PART,
+    PartFile,
+    RecordingWriter,
+    StoredChannel,
+    WriteError,
+    check_free,
+    is_locked,
+    lock_orphan,
+)
 from tests.unit.recorder import golden
+from tests.unit.recorder.recording import Disk
 
 ENTRIES = list(golden.entries())[:30]
 FIRST, SECOND = ENTRIES[:15], ENTRIES[15:]
-
-
-class Disk:
-    """Disk with a room in bytes; a write may be taken in part."""
-
-    room = 10**9
-
-    def open(self, path: Path) -> PartFile:
-        disk = self
-
-        class OnDisk(PartFile):
-            def _append(self, data: bytearray) -> int:
-                if not disk.room:
-                    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-                taken = super()._append(data[: disk.room])
-                disk.room -= taken
-                return taken
-
-        return OnDisk(path)
 
 
 def start_second_chunk(folder: Path) -> tuple[Disk, RecordingWriter, Path]:
@@ -139,27 +136,8 @@ def test_the_library_meets_no_error_of_the_disk(
     assert not any(inside)
 
 
-def test_the_library_reads_a_recording_and_its_statistics_agree(tmp_path: Path) -> None:
-    path = tmp_path / "run.mcap"
-    with RecordingWriter(path, {"plant": "cstr"}) as writer:
-        for number, entry in enumerate(ENTRIES):
-            writer.write(entry)
-            if number % 7 == 6:
-                writer.flush()
-    with path.open("rb") as stream:
-        reader = make_reader(stream, validate_crcs=True)
-        found = [(channel.topic, message.data) for _, channel, message in reader.iter_messages(log_time_order=False)]
-        summary = reader.get_summary()
-    assert found == [(entry.key, entry.payload) for entry in ENTRIES]
-    assert summary is not None
-    assert summary.statistics is not None
-    assert summary.statistics.message_count == len(ENTRIES)
-    assert summary.statistics.chunk_count == -(-len(ENTRIES) // 7)
-
-
 def test_a_recording_that_cannot_be_started_leaves_no_file(tmp_path: Path) -> None:
-    disk, path = Disk(), tmp_path / "run.mcap"
-    disk.room = 20
+    disk, path = Disk(20), tmp_path / "run.mcap"
     with pytest.raises(WriteError) as raised:
         RecordingWriter(path, {}, disk.open)
     assert str(raised.value) == f"recording {path}: cannot be written: No space left on device"
@@ -276,3 +254,68 @@ def test_messages_before_an_attachment_are_in_the_file_ahead_of_it(tmp_path: Pat
     reader = Reader(tmp_path / "run.mcap")
     assert len(list(reader)) == 1
     assert [item.name for item in reader.attachments()] == ["a"]
+
+
+DATA = b"x" * 1000
+
+
+def open_part(folder: Path) -> PartFile:
+    """A new file in a folder."""
+    return PartFile(folder / f"run.mcap{PART}")
+
+
+@contextlib.contextmanager
+def abandoned(file: PartFile) -> Iterator[PartFile]:
+    """A file that is abandoned at the end."""
+    try:
+        yield file
+    finally:
+        file.abandon()
+
+
+@pytest.mark.parametrize(
+    "act", [PartFile.sync, lambda file: file.finish(file.path.with_suffix(""))], ids=["sync", "finish"]
+)
+def test_the_system_is_asked_to_write_all_bytes_to_the_disk(
+    act: Callable[[PartFile], None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    synced = list[tuple[int, bool, int]]()
+    path = tmp_path / f"run.mcap{PART}"
+    file = PartFile(path)
+    number = path.stat().st_ino
+
+    def record(descriptor: int) -> None:
+        status = os.fstat(descriptor)
+        synced.append((status.st_ino, path.exists(), status.st_size))
+
+    monkeypatch.setattr(os, "fsync", record)
+    file.write(DATA)
+    act(file)
+    file.abandon()
+    assert synced == [(number, True, len(DATA))]
+
+
+def test_a_file_that_cannot_be_renamed_is_closed_under_its_old_name(tmp_path: Path) -> None:
+    file = open_part(tmp_path)
+    file.write(DATA)
+    with pytest.raises(FileNotFoundError):
+        file.finish(tmp_path / "none" / "run.mcap")
+    assert (file.closed, file.path.read_bytes(), is_locked(file.path)) == (True, DATA, False)
+
+
+def test_an_orphan_that_another_file_replaced_while_it_was_locked_is_left_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / f"run.mcap{PART}"
+    path.write_bytes(DATA)
+    lock = fcntl.flock
+
+    def replace(*arguments: Any) -> None:
+        lock(*arguments)
+        path.unlink()
+        path.write_bytes(b"")
+
+    monkeypatch.setattr(fcntl, "flock", replace)
+    with pytest.raises(FileNotFoundError, match="is another file by now"), lock_orphan(path):
+        pass
+    assert not is_locked(path)

@@ -13,13 +13,13 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from rich.text import Text
 
-from reactorwatch.axis import axis
 from reactorwatch.cli.backtest import RowsOfFile, write_rows
 from reactorwatch.cli.batch import write_summary
 from reactorwatch.cli.display import Screen, _escape_markup, format_rows, wrap_line
 from reactorwatch.cli.recordings import _report_text
-from reactorwatch.diagnosis.report import mathml, svg
+from reactorwatch.diagnosis.report import mathml
 from reactorwatch.errors import InputError
+from reactorwatch.figures import Line, Panel, panel_svg
 from reactorwatch.records.decode import quote_formula, unquote_formula
 from reactorwatch.records.read import read_table
 from reactorwatch.records.record import Record
@@ -122,10 +122,11 @@ HTML = ["<script>alert(1)</script>", "<img src=x onerror=alert(1)>", "a&lt;b", '
 
 @pytest.mark.parametrize("name", HTML)
 def test_a_name_in_a_page_is_text(name: str) -> None:
-    for page in (mathml.name(name), svg._frame(svg._Time(0.0, 10.0), axis(0.0, 1.0, 4), name)):
+    times = np.arange(3.0)
+    for page in (mathml.name(name), panel_svg(Panel(name, (Line(name, times, times),), x_title=name))):
         found = Tags()
         found.feed(page)
-        assert set(found.tags) <= {"mi", "mn", "msub", "path", "text"}, page
+        assert set(found.tags) <= {"mi", "mn", "msub", "path", "svg", "text"}, page
 
 
 @pytest.mark.parametrize(

@@ -259,6 +259,11 @@ def _variants() -> dict[str, Variant]:
         "a line of text at the end": _text(plain + "\n(240 rows affected)\n"),
         "a header that is repeated": _text(plain.replace("\n9,", "\ntime_min,qc,C,T\n9,")),
         "names that occur twice, beside the signals": _text(table(MINUTES, [[*row, "ok", "ok"] for row in cells()], ("time_min", "qc", "C", "T", "Status", "Status"))),
+        "no last line end": _text(plain.rstrip("\n")),
+        "blank lines around": _text("\n" + plain + "\n \n"),
+        "blanks around the cells": _text(plain.replace(",", " , ")),
+        "columns in another order": _text("\n".join(",".join(line.split(",")[::-1]) for line in plain.split("\n"))),
+        "quotes": _text("\n".join(",".join(f'"{cell}"' for cell in line.split(",")) for line in plain.splitlines()) + "\n"),
         "dashes": _text(table(MINUTES, cells("---")), has_holes=True),
         "comma as separator and decimal sign": _text(
             table([f"{row},0" for row in range(ROWS)], commas(cells())), stated=FileFormat(decimal=",")

@@ -15,9 +15,8 @@ from cryptography.x509.verification import PolicyBuilder, Store, VerificationErr
 
 from reactorwatch.contract import keys
 from reactorwatch.errors import InputError
-from reactorwatch.runtime.config import BusConfig, read_settings, section
-from reactorwatch.runtime.security.acl import ROLES, access_control
-from reactorwatch.runtime.security.certificates import (
+from reactorwatch.runtime.acl import ROLES, access_control
+from reactorwatch.runtime.certificates import (
     Identity,
     issue,
     make_authority,
@@ -25,7 +24,8 @@ from reactorwatch.runtime.security.certificates import (
     read_common_name,
     read_key,
 )
-from reactorwatch.runtime.security.provisioning import make_site
+from reactorwatch.runtime.config import BusConfig, read_settings, section
+from reactorwatch.runtime.provisioning import make_site
 
 NOW = datetime.datetime(2026, 1, 1, tzinfo=datetime.UTC)
 DAY = datetime.timedelta(days=1)

@@ -1,4 +1,7 @@
-"""The event loop of the nodes: no message is lost, ticks come when they are due, a stop acts at once."""
+"""The event loop of the nodes: no message is lost, ticks come when they are due, a stop acts at once.
+
+Its clock is the machine's, but for when that is set back.
+"""
 
 import signal
 import threading
@@ -11,7 +14,7 @@ import pytest
 from reactorwatch.contract.codec import Encoded, Publication
 from reactorwatch.contract.messages_pb2 import CommandReply, Health
 from reactorwatch.runtime.bus import MAX_BATCH
-from reactorwatch.runtime.event_loop import EventLoop, StopSignal, stop_on_signals
+from reactorwatch.runtime.event_loop import EventLoop, SteadyClock, StopSignal, stop_on_signals
 from tests.memory_bus import Exchange, MemoryBus
 from tests.running import WITHIN_S, running
 
@@ -243,26 +246,6 @@ def test_a_bus_that_never_falls_silent_does_not_keep_a_node_from_ending() -> Non
     assert node.stopped
 
 
-def test_a_question_is_answered_by_the_node() -> None:
-    exchange, stop, answered = Exchange(), StopSignal(), threading.Event()
-
-    class Question:
-        question = Encoded("command/x", b"hello", "")
-        answer: CommandReply | None = None
-
-        def reply(self, message: CommandReply) -> None:
-            self.answer = message
-            answered.set()
-
-    asked = Question()
-    loop = EventLoop(Echo(), MemoryBus(exchange), stop)
-    loop.accept_commands("command/*")
-    with running(loop.run, stop):
-        exchange.queryables[0][2](asked)  # type: ignore[arg-type]
-        assert answered.wait(WITHIN_S)
-    assert asked.answer == CommandReply(accepted=True, text="hello")
-
-
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_that_arrives_while_the_main_thread_holds_a_lock_still_wakes_the_thread_that_needs_it(
     number: signal.Signals,
@@ -386,3 +369,44 @@ def test_messages_are_handed_over_together_in_their_order_and_tokens_as_they_com
     assert not thread.is_alive()
     assert received == [f"in/{number}" for number in range(1000)]
     assert alive == [("alive/x", True), ("alive/x", False)]
+
+
+SECOND = 1_000_000_000
+
+
+class Machine:
+    """A machine's clocks."""
+
+    def __init__(self) -> None:
+        self.passed_ns, self.set_ns = 0, 1_000 * SECOND
+
+    def wall_ns(self) -> int:
+        return self.set_ns + self.passed_ns
+
+    def monotonic_ns(self) -> int:
+        return self.passed_ns
+
+
+def test_it_follows_the_machine_s_clock_also_when_that_is_set_forward() -> None:
+    machine = Machine()
+    clock = SteadyClock(machine.wall_ns, machine.monotonic_ns)
+    for step_ns in (0, 1, SECOND, 3600 * SECOND):
+        machine.passed_ns += SECOND
+        machine.set_ns += step_ns
+        assert clock.now_ns() == machine.wall_ns()
+
+
+def test_when_the_machine_s_clock_is_set_back_it_runs_more_slowly_until_it_is_right_again() -> None:
+    machine = Machine()
+    clock = SteadyClock(machine.wall_ns, machine.monotonic_ns)
+    machine.set_ns -= 60 * SECOND
+    ahead = []
+    for _ in range(700):
+        before_ns = clock.now_ns()
+        machine.passed_ns += SECOND
+        assert clock.now_ns() - before_ns >= 0.9 * SECOND - 1
+        ahead.append(clock.now_ns() - machine.wall_ns())
+    assert ahead[0] > 59 * SECOND
+    assert ahead == sorted(ahead, reverse=True)
+    assert ahead[598] > 0
+    assert ahead[-1] == 0

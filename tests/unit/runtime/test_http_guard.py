@@ -1,19 +1,29 @@
-"""Pages answer to requests that name this machine, and close connections that do not finish to ask."""
+"""Pages answer to requests that name this machine, and close connections that do not finish to ask.
 
+A free port of the loopback address stays reserved for the process that named it.
+"""
+
+import errno
 import http.server
 import socket
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
-from functools import partial
 
 import pytest
 
-from reactorwatch.runtime import http_guard
+from reactorwatch.runtime import http_pages as http_guard
 from reactorwatch.runtime.config import MetricsConfig
-from reactorwatch.runtime.http_guard import GuardedPort, guard_application, is_own_host
-from reactorwatch.runtime.loopback import LOOPBACK, free_port
-from reactorwatch.runtime.metrics import Metrics, serve_metrics
+from reactorwatch.runtime.http_pages import (
+    LOOPBACK,
+    GuardedPort,
+    Metrics,
+    free_port,
+    is_own_host,
+    reserve_port,
+    serve_metrics,
+)
+from tests.ports import three_free_ports
 from tests.running import WITHIN_S
 
 OWN = (
@@ -27,11 +37,6 @@ OWN = (
     "a.lan",
 )
 OTHER = ("evil.example", "evil.example:9101", "127.0.0.1.evil.example", "localhost.evil.example", "", "evil.example.")
-
-
-@pytest.mark.parametrize(("hosts", "is_own"), [(OWN, True), (OTHER, False)])
-def test_names_that_others_can_register_are_not_this_machine(hosts: tuple[str, ...], *, is_own: bool) -> None:
-    assert {host: is_own_host(host) for host in hosts} == dict.fromkeys(hosts, is_own)
 
 
 def test_the_name_of_this_machine_is_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -135,19 +140,20 @@ def test_metrics_are_served_to_requests_that_name_this_machine_alone(
             assert (b"200 OK" in came, b"process_cpu_seconds_total" in came) == (is_served, is_served), host
 
 
-@pytest.mark.parametrize(("hosts", "status"), [(OWN, "200 OK"), (OTHER, "421 Misdirected Request")])
-def test_an_application_is_guarded_in_the_same_way(hosts: tuple[str, ...], status: str) -> None:
-    def page(_environ: object, start_response: object) -> list[bytes]:
-        assert callable(start_response)
-        start_response("200 OK", [])
-        return [b"secret"]
-
-    for host in hosts:
-        given = list[tuple[str, object]]()
-        body = b"".join(guard_application(page)({"HTTP_HOST": host}, partial(_note, given)))
-        assert [came for came, _ in given] == [status]
-        assert (body == b"secret") == (status == "200 OK")
+def test_a_kept_port_is_not_given_to_a_socket_that_asks_for_any_and_can_be_had_by_name() -> None:
+    port = free_port()
+    with socket.socket() as anybody, pytest.raises(OSError, match="in use") as refused:
+        anybody.bind((LOOPBACK, port))
+    assert refused.value.errno == errno.EADDRINUSE
+    with socket.create_server((LOOPBACK, port)) as server:
+        assert server.getsockname()[1] == port
 
 
-def _note(given: list[tuple[str, object]], status: str, headers: object) -> None:
-    given.append((status, headers))
+def test_a_port_in_use_is_not_kept() -> None:
+    with socket.create_server((LOOPBACK, 0)) as server, pytest.raises(OSError, match="in use"):
+        reserve_port(server.getsockname()[1])
+
+
+def test_three_free_ports_are_kept_for_the_first_caller() -> None:
+    first, second = three_free_ports(), three_free_ports()
+    assert not {*range(first, first + 3)} & {*range(second, second + 3)}

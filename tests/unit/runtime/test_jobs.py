@@ -10,8 +10,17 @@ from pathlib import Path
 import pytest
 
 from reactorwatch.errors import InputError
-from reactorwatch.runtime.executors import THREADS, ProcessExecutor, available_cores, choose_executor
-from reactorwatch.runtime.jobs import RETRIES, Executor, Failed, SerialExecutor, in_job_order
+from reactorwatch.runtime.jobs import (
+    RETRIES,
+    THREADS,
+    Executor,
+    Failed,
+    ProcessExecutor,
+    SerialExecutor,
+    available_cores,
+    choose_executor,
+    in_job_order,
+)
 from tests.cluster import dask_cluster
 from tests.running import WITHIN_S
 from tests.unit.runtime.work import deadly, endless, linear_algebra_threads, picky, square, unspeakable
@@ -156,13 +165,13 @@ def test_without_dask_the_cure_is_reported(monkeypatch: pytest.MonkeyPatch) -> N
 def test_workers_with_another_version_or_none_are_reported(
     cluster: str, theirs: str | None, said: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("reactorwatch.runtime.dask_workers._version_query", lambda: lambda: theirs)
+    monkeypatch.setattr("reactorwatch.runtime.jobs._version_query", lambda: lambda: theirs)
     with pytest.raises(InputError, match=said):
         list(choose_executor(None, cluster).map_unordered(square, range(2)))
 
 
 def test_a_cluster_without_workers_is_reported_with_the_cure(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("reactorwatch.runtime.dask_workers.WORKERS_WITHIN_S", 0.2)
+    monkeypatch.setattr("reactorwatch.runtime.jobs.WORKERS_WITHIN_S", 0.2)
     with dask_cluster(0) as address:
         said = f"has no workers; start some with: dask worker {address} --nthreads 1"
         with pytest.raises(InputError, match=said):
@@ -171,7 +180,7 @@ def test_a_cluster_without_workers_is_reported_with_the_cure(monkeypatch: pytest
 
 def test_a_missing_scheduler_is_reported_by_its_address(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("distributed", reason="Dask (reactorwatch[cluster]) is not installed")
-    monkeypatch.setattr("reactorwatch.runtime.dask_workers.CONNECT_WITHIN_S", 0.2)
+    monkeypatch.setattr("reactorwatch.runtime.jobs.CONNECT_WITHIN_S", 0.2)
     with pytest.raises(InputError, match=r"^--scheduler tcp://127\.0\.0\.1:1: cannot be reached: "):
         list(choose_executor(None, "tcp://127.0.0.1:1").map_unordered(square, range(2)))
 

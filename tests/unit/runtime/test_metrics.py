@@ -13,8 +13,7 @@ from reactorwatch.contract.codec import Publication
 from reactorwatch.contract.messages_pb2 import Alarm, AlarmState, Health, Sample
 from reactorwatch.errors import InputError
 from reactorwatch.runtime.config import MetricsConfig, section
-from reactorwatch.runtime.loopback import LOOPBACK
-from reactorwatch.runtime.metrics import PORT_OFFSET, Metrics, serve_metrics
+from reactorwatch.runtime.http_pages import LOOPBACK, PORT_OFFSET, Metrics, serve_metrics
 from tests.ports import three_free_ports
 from tests.running import WITHIN_S
 
@@ -43,12 +42,12 @@ OF_NODE = 'node="monitor",plant="R-101"'
 @pytest.fixture
 def port() -> int:
     """Of the plant's page; the others are free as well."""
+    pytest.importorskip("prometheus_client", reason="prometheus-client (reactorwatch[metrics]) is not installed")
     return three_free_ports()
 
 
 def page(port: int, node: str = "monitor") -> dict[str, float]:
     """Value by name and labels, as read over HTTP."""
-    pytest.importorskip("prometheus_client", reason="prometheus-client (reactorwatch[metrics]) is not installed")
     from prometheus_client.parser import text_string_to_metric_families
 
     with urlopen(f"http://{LOOPBACK}:{port + PORT_OFFSET[node]}/metrics", timeout=WITHIN_S) as answer:
@@ -76,7 +75,6 @@ def alarms() -> list[Alarm]:
 @pytest.fixture
 def publish(port: int, alarms: list[Alarm]) -> Iterator[Publish]:
     """Publishes as the monitor, whose page is served."""
-    pytest.importorskip("prometheus_client", reason="prometheus-client (reactorwatch[metrics]) is not installed")
     page = Metrics("monitor", {"R-101": lambda: alarms}, lambda: 5_000_000)
     with serve_metrics(MetricsConfig(port=port), page) as metrics:
         assert metrics is not None
@@ -138,7 +136,6 @@ def test_a_node_that_has_published_nothing_yet_has_a_page_without_counts(port: i
 def test_the_page_of_a_fleet_has_the_counts_and_alarms_of_each_plant_that_is_watched(
     port: int, alarms: list[Alarm]
 ) -> None:
-    pytest.importorskip("prometheus_client", reason="prometheus-client (reactorwatch[metrics]) is not installed")
     found: dict[str, list[Alarm] | None] = {"a": alarms, "b": alarms[1:], "c": alarms}
     with serve_metrics(MetricsConfig(port=port), Metrics("monitor")) as metrics:
         assert metrics is not None
@@ -167,8 +164,7 @@ def test_the_page_of_a_fleet_has_the_counts_and_alarms_of_each_plant_that_is_wat
 def test_the_page_of_a_fleet_has_so_many_plants_and_one_that_leaves_makes_room(
     port: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    pytest.importorskip("prometheus_client", reason="prometheus-client (reactorwatch[metrics]) is not installed")
-    monkeypatch.setattr("reactorwatch.runtime.metrics.MAX_PLANTS", 2)
+    monkeypatch.setattr("reactorwatch.runtime.http_pages.MAX_PLANTS", 2)
     with serve_metrics(MetricsConfig(port=port), Metrics("monitor")) as metrics:
         assert metrics is not None
         for plant in "abc":
@@ -185,7 +181,6 @@ def test_a_disk_that_is_gone_leaves_its_number_out(port: int) -> None:
     def gone() -> int:
         raise FileNotFoundError
 
-    pytest.importorskip("prometheus_client", reason="prometheus-client (reactorwatch[metrics]) is not installed")
     with serve_metrics(MetricsConfig(port=port), Metrics("recorder", {"R-101": None}, gone)):
         assert not any("disk" in name for name in page(port, "recorder"))
 
@@ -196,7 +191,6 @@ def test_nothing_is_served_unless_asked() -> None:
 
 
 def test_the_page_goes_with_the_node(port: int) -> None:
-    pytest.importorskip("prometheus_client", reason="prometheus-client (reactorwatch[metrics]) is not installed")
     for _ in range(2):  # the port is free again, too
         with serve_metrics(MetricsConfig(port=port), Metrics("plant", {"R-101": None})):
             assert page(port, "plant")
@@ -220,8 +214,7 @@ class Lines:
 def test_a_port_in_use_stops_no_node_is_reported_in_health_and_is_served_once_it_is_free(
     port: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    pytest.importorskip("prometheus_client", reason="prometheus-client (reactorwatch[metrics]) is not installed")
-    monkeypatch.setattr("reactorwatch.runtime.metrics.log", lines := Lines())
+    monkeypatch.setattr("reactorwatch.runtime.http_pages.log", lines := Lines())
     key = "reactor/R-101/health/monitor"
     taken = socket.create_server((LOOPBACK, port + 1))
     with closing(taken), serve_metrics(MetricsConfig(port=port), Metrics("monitor", {"R-101": None})) as metrics:
@@ -238,7 +231,6 @@ def test_a_port_in_use_stops_no_node_is_reported_in_health_and_is_served_once_it
 
 
 def test_a_node_ends_at_once_while_its_port_is_taken(port: int) -> None:
-    pytest.importorskip("prometheus_client", reason="prometheus-client (reactorwatch[metrics]) is not installed")
     with socket.create_server((LOOPBACK, port)):
         with serve_metrics(MetricsConfig(port=port), Metrics("plant")) as metrics:
             assert metrics is not None

@@ -13,16 +13,15 @@ from hypothesis import strategies as st
 
 from monitor_node.config import MonitorConfig
 from monitor_node.node import MonitorNode
-from monitor_node.storage.state_files import StateStore
+from monitor_node.state_files import StateStore
 from reactorwatch.contract.codec import Encoded, decode
 from reactorwatch.contract.messages_pb2 import Health
 from reactorwatch.errors import InputError, UnavailableError, is_passing
 from reactorwatch.records.write import atomic_write, make_folder
 from reactorwatch.runtime import bus_zenoh
 from reactorwatch.runtime.config import BusConfig
-from reactorwatch.runtime.event_loop import StopSignal
-from reactorwatch.runtime.loopback import LOOPBACK
-from reactorwatch.runtime.retry import retry
+from reactorwatch.runtime.event_loop import StopSignal, retry
+from reactorwatch.runtime.http_pages import LOOPBACK
 from reactorwatch.runtime.start import GONE_WITHIN_S, claim_name, instance_name, wait_ready
 from recorder.config import RecorderConfig
 from recorder.node import RecorderNode

@@ -11,10 +11,10 @@ from cryptography import x509
 from cryptography.x509.verification import PolicyBuilder, Store
 
 from reactorwatch.errors import InputError
+from reactorwatch.runtime.acl import ROLES, access_control, parse_common_name
+from reactorwatch.runtime.certificates import read_certificate, read_common_name, read_key
 from reactorwatch.runtime.config import BusConfig, read_settings, section
-from reactorwatch.runtime.security.acl import ROLES, access_control, parse_common_name
-from reactorwatch.runtime.security.certificates import read_certificate, read_common_name, read_key
-from reactorwatch.runtime.security.provisioning import MAX_PLANT_NAME, make_site
+from reactorwatch.runtime.provisioning import MAX_PLANT_NAME, make_site
 
 NOW = datetime.datetime(2026, 1, 1, tzinfo=datetime.UTC)
 DAY = datetime.timedelta(days=1)

@@ -122,17 +122,11 @@ def test_a_memory_of_another_chart_is_refused() -> None:
         Shewhart.resume(Ewma(0.0, 1.0).memory)
 
 
-@pytest.mark.parametrize(
-    ("new", "message"),
-    [
-        (lambda: Shewhart(0.0, 0.0), "sigma must be a positive number, got 0.0"),
-        (lambda: Shewhart(0.0, 1.0, rules=(1, 5)), r"rules must be some of 1, 2, 3, 4, got \(1, 5\)"),
-        (lambda: Ewma(0.0, 1.0, weight=1.5), r"weight \(lambda\) must be in \(0, 1\], got 1.5"),
-    ],
-)
-def test_settings_out_of_range_are_named(new: Any, message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        new()
+@pytest.mark.parametrize("kind", COMPILED_CHARTS, ids=lambda chart: chart.name)
+def test_a_standard_deviation_of_zero_is_refused(kind: Any) -> None:
+    """Other settings out of range are those that have no run length, see `test_run_length.py`."""
+    with pytest.raises(InputError, match=r"sigma must be a positive number, got 0\.0"):
+        kind(0.0, 0.0)
 
 
 def test_rules_count_only_points_that_complete_a_pattern() -> None:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from reactorwatch.spc.charts.residual_space import ResidualSpace, degrees_of_freedom, held_out_residuals, moderate
-from reactorwatch.spc.value_chart import BLOCKS, SHRINKAGE, ValueBaseline, adjustment, average_rows
+from reactorwatch.spc.charts.value_chart import BLOCKS, SHRINKAGE, ValueBaseline, adjustment, average_rows
 
 from .members import Array
 
@@ -31,7 +31,7 @@ def designed(values: Array, arl0: float = ARL0) -> ResidualSpace:
 
 def test_each_residual_is_that_of_the_regression_of_a_signal_on_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
     """Without shrinkage; by least squares, in units of its standard deviation."""
-    monkeypatch.setattr("reactorwatch.spc.value_chart.SHRINKAGE", 0.0)
+    monkeypatch.setattr("reactorwatch.spc.charts.value_chart.SHRINKAGE", 0.0)
     rng = np.random.default_rng(1)
     rows = sound(rng, 300, rng.standard_normal((5, 2)))
     centre, matrix = adjustment(rows)

@@ -64,12 +64,6 @@ def test_run_lengths_are_those_published(computed: Callable[[], float], length: 
     assert computed() == pytest.approx(length, abs=tolerance)
 
 
-@pytest.mark.parametrize(("dimension", "length", "limit"), flat(published.T2_LIMITS))
-def test_t2_limits(dimension: int, length: float, limit: float) -> None:
-    """The limit of the table gives the run length that it stands for, to its digits."""
-    assert t2_run_length(0.0, dimension, limit) == pytest.approx(length, rel=5e-4)
-
-
 def test_the_table_of_the_page_is_the_one_computed() -> None:
     """If not: `python -m tests.unit.spc.tables` writes it anew."""
     assert PAGE.read_text().split(BEGIN)[1].split(END)[0] == table()

@@ -4,6 +4,7 @@ from math import nan
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from reactorwatch.errors import InputError
 from reactorwatch.spc.silence import NO_CHANGE, Change, DataTimeout
@@ -114,17 +115,18 @@ def test_after_a_long_silence_the_next_is_noticed_nearly_as_soon() -> None:
     assert of_plant(silence, 1111 * PERIOD).raised_ns is not None
 
 
-def test_irregular_rows_are_no_silence() -> None:
+@pytest.mark.parametrize(
+    "times",
+    [
+        np.cumsum(np.random.default_rng(1).exponential(PERIOD, 20_000)).astype(int),
+        PERIOD * np.flatnonzero(np.random.default_rng(2).random(20_000) > 0.05),
+    ],
+    ids=["irregular", "lost singly"],
+)
+def test_irregular_rows_and_rows_that_get_lost_singly_are_no_silence(times: NDArray[np.int64]) -> None:
     """Exponential spacings: allowed are 5 (1 + 2 * 2/e) = 12.4 means, which 4 in a million are longer than."""
-    times = np.cumsum(np.random.default_rng(1).exponential(PERIOD, 20_000)).astype(int)
     silence = DataTimeout(1, limit=5.0)
     assert all(of_plant(silence, time_ns) == NO_CHANGE for time_ns in times.tolist())
-
-
-def test_rows_that_get_lost_singly_are_no_silence() -> None:
-    kept = np.flatnonzero(np.random.default_rng(2).random(20_000) > 0.05)
-    silence = DataTimeout(1, limit=5.0)
-    assert all(of_plant(silence, int(row) * PERIOD) == NO_CHANGE for row in kept)
 
 
 def test_a_plant_that_resumes_ten_times_slower_is_accepted_after_a_few_rows() -> None:

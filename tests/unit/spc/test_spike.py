@@ -52,11 +52,6 @@ def test_a_spike_is_reported_with_its_size_when_the_next_value_is_back() -> None
 
 
 @given(st.lists(st.floats(-20, 20), max_size=60))
-def test_never_more_than_two_values_in_a_row_are_withheld(values: list[float]) -> None:
-    assert "www" not in story(values).replace("b", "w")
-
-
-@given(st.lists(st.floats(-20, 20), max_size=60))
 def test_every_spike_was_withheld_just_before(values: list[float]) -> None:
     said = story(values)
     assert said[:1] in ("", ".", "w")

@@ -13,9 +13,8 @@ from reactorwatch.spc.charts.cva_residual import ROWS, CvaResidual, inverse_root
 from reactorwatch.spc.charts.multiple_pca import Mixture, MultiplePca, divide, fit_mixture, maximise
 from reactorwatch.spc.charts.multiway_pca import STAGES, MultiwayPca, batch_starts
 from reactorwatch.spc.charts.pls import Pls, Projection, choose_components
+from reactorwatch.spc.charts.value_chart import StatisticsChart, ValueBaseline, average_variance
 from reactorwatch.spc.prewhitening import Prewhitening
-from reactorwatch.spc.statistics_chart import StatisticsChart, average_variance
-from reactorwatch.spc.value_chart import ValueBaseline
 from tests.unit.spc.members import Array
 from tests.unit.spc.test_residual_space import sound
 

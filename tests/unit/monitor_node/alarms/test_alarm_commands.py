@@ -1,14 +1,15 @@
-"""Operators' alarm commands on the bus: done and published, or refused in one line with nothing changed."""
+"""Operators' alarm commands on the bus: done and published, or refused in one line with nothing changed.
 
-import gc
-import shutil
+A flood of commands is refused beyond a rate, by name and in all, and occasional commands are still served.
+"""
+
 from pathlib import Path
 
 import pytest
 from google.protobuf.message import Message
 from msgspec.structs import replace
 
-from monitor_node.alarms.commands import COMMANDS
+from monitor_node.alarms.commands import ALL, COMMANDS, MAX_NAMES, PER_NAME, CommandRateLimiter, sender_name
 from monitor_node.config import MonitorConfig
 from monitor_node.node import MonitorNode
 from plant_node.node import COMMANDS as PLANT_COMMANDS
@@ -23,10 +24,8 @@ from reactorwatch.contract.messages_pb2 import (
     ListAlarms,
     ShelveAlarm,
 )
-from reactorwatch.errors import InputError
 from reactorwatch.records.record import to_time_ns
 from reactorwatch.runtime.bus import Request
-from reactorwatch.runtime.security.command_rate import PER_NAME
 from tests.memory_bus import Exchange, MemoryBus
 
 from ..samples import PLANT, leaking_run, samples
@@ -246,17 +245,6 @@ def test_a_flood_of_commands_is_refused_counted_and_written_nowhere(
     assert reply.accepted
 
 
-def test_another_monitor_of_the_plant_is_reported(room: Room, capsys: pytest.CaptureFixture[str]) -> None:
-    """And its own token, which it sees as well, is not."""
-    room.node.on_alive(room.node.token, True, 0)
-    assert capsys.readouterr().out == ""
-    other = MonitorNode(CONFIG, 7).token
-    assert room.node.on_alive(other, True, 0) == []
-    assert "another monitor watches this plant; stop one of them" in capsys.readouterr().out
-    room.node.on_alive(other, False, 0)
-    assert "the other monitor of this plant has gone" in capsys.readouterr().out
-
-
 def test_before_the_first_sample_nothing_can_be_acknowledged() -> None:
     reply = Room(CONFIG).ask("acknowledge", by_anna())
     assert not reply.accepted
@@ -267,41 +255,56 @@ def test_the_plant_and_the_monitor_share_no_command() -> None:
     assert not set(COMMANDS) & set(PLANT_COMMANDS)
 
 
-def test_alarm_states_survive_a_restart(tmp_path: Path, leak: list[Encoded]) -> None:
-    """The first monitor was killed, and the second has other settings: it has the alarms, and trains."""
-    config = replace(CONFIG, state_file=str(tmp_path / "monitor.state"))
-    first = Room(config)
-    first.receive(leak)
-    first.ask("acknowledge", by_anna(comment="seen"))
-    first.ask("shelve", ShelveAlarm(alarm="shewhart/C", by="Ben", minutes=5.0))
-    del first
-    gc.collect()  # the lock of its file ends with it, as with a process
-
-    second = Room(replace(config, order=2))
-    c, t = (listed(second)[name] for name in ("shewhart/C", "shewhart/T"))
-    assert (t.state, t.by, t.comment, t.incident) == (AlarmState.ALARM_STATE_ACKNOWLEDGED, "Anna", "seen", 1)
-    assert (c.state, c.shelved_until_ns) == (AlarmState.ALARM_STATE_SHELVED, to_time_ns(END_MIN + 5))
-    time_min, columns = leaking_run(0.0, 1.0, 10.0, seed=1)
-    said = second.receive(list(samples(time_min + END_MIN, columns)))
-    (back,) = [item.message for item in said if isinstance(item.message, Alarm) and item.message.alarm == c.alarm]
-    assert (back.alarm, back.event, back.time_ns) == ("shewhart/C", "shelf time over", to_time_ns(END_MIN + 5))
-    assert second.node.monitor(PLANT).phase == "training"
+SECOND = 1_000_000_000
 
 
-def test_a_file_in_no_folder_is_refused_at_the_start(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="does not exist"):
-        MonitorNode(MonitorConfig(state_file=str(tmp_path / "none" / "monitor.state")), 0)
+def count_obeyed(rate: CommandRateLimiter, names: list[str], now_ns: int = 0) -> int:
+    """Number of the commands that are obeyed."""
+    return sum(rate.check(name, now_ns) is None for name in names)
 
 
-def test_a_file_that_can_no_longer_be_written_stops_no_watch(
-    tmp_path: Path, alarmed: bytes, capsys: pytest.CaptureFixture[str]
-) -> None:
-    folder = tmp_path / "gone"
-    folder.mkdir()
-    room = Room(replace(CONFIG, state_file=str(folder / "monitor.state")), alarmed)
-    shutil.rmtree(folder)
-    assert room.ask("acknowledge", by_anna()).accepted
-    assert "does not exist" in capsys.readouterr().out
-    folder.mkdir()
-    room.node.on_tick(10_000_000_000)  # it is tried again
-    assert (folder / "monitor.state").stat().st_size > 0
+@pytest.mark.parametrize(
+    ("names", "at_once"),
+    [(["Anna"] * 3000, PER_NAME.at_once), ([str(n) for n in range(3000)], ALL.at_once), ([""] * 3000, ALL.at_once)],
+    ids=["one name", "made-up names", "questions"],
+)
+def test_of_a_flood_as_many_are_taken_as_may_come_at_once(names: list[str], at_once: float) -> None:
+    assert count_obeyed(CommandRateLimiter(), names) == at_once
+
+
+def test_over_a_minute_the_rate_is_taken() -> None:
+    rate = CommandRateLimiter()
+    obeyed = sum(count_obeyed(rate, ["Anna"] * 50, second * SECOND) for second in range(60))
+    assert obeyed == PER_NAME.at_once + 59 * PER_NAME.per_s
+
+
+def test_one_person_s_flood_does_not_refuse_another_s_command() -> None:
+    rate = CommandRateLimiter()
+    assert count_obeyed(rate, ["Anna"] * 3000) == PER_NAME.at_once
+    assert count_obeyed(rate, ["Ben"]) == 1
+
+
+def test_questions_do_not_refuse_commands() -> None:
+    rate = CommandRateLimiter()
+    count_obeyed(rate, [""] * 3000)
+    assert count_obeyed(rate, ["Ben"]) == 1
+
+
+def test_a_clock_that_is_set_back_fills_no_bucket_and_ends_the_refusals() -> None:
+    rate = CommandRateLimiter()
+    count_obeyed(rate, ["Anna"] * 3000, 1000 * SECOND)
+    assert count_obeyed(rate, ["Anna"], 0) == 0
+    assert count_obeyed(rate, ["Anna"], SECOND) == 1
+
+
+def test_made_up_names_take_no_memory() -> None:
+    rate = CommandRateLimiter()
+    for number in range(3 * MAX_NAMES):
+        rate.check(str(number), number * SECOND)
+    assert len(rate._names) == MAX_NAMES
+
+
+def test_the_sender_is_the_name_in_the_command() -> None:
+    assert sender_name(Encoded("k", *encode_message(AlarmCommand(alarm="x", by=" Anna ")))) == "Anna"
+    assert sender_name(Encoded("k", *encode_message(ListAlarms()))) == ""
+    assert sender_name(Encoded("k", b"?", "text/plain")) == ""

@@ -3,8 +3,6 @@
 import msgspec
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from monitor_node.alarms.alarms import SuspectedCause
 from monitor_node.alarms.annunciator import AnnunciatorMemory
@@ -14,7 +12,7 @@ from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from reactorwatch.contract.alarm_states import Event, State
 from reactorwatch.contract.codec import encode
-from reactorwatch.contract.messages_pb2 import Alarm, AlarmKpis, AlarmState, Incident, Priority
+from reactorwatch.contract.messages_pb2 import Alarm, AlarmState, Incident, Priority
 from reactorwatch.errors import InputError
 from reactorwatch.records.record import to_time_ns
 from reactorwatch.spc.charts.base import Judgement
@@ -303,48 +301,11 @@ def test_a_stored_annunciator_resumes_as_if_it_had_never_stopped() -> None:
     assert stayed.board.memory.to_bytes() == back.board.memory.to_bytes()
 
 
-def test_figures_of_each_minute_carry_its_time_and_follow_what_time_alone_changes() -> None:
-    desk = Desk()
-    for minute in range(3):
-        desk.point(float(minute), T=0.0)
-    desk.point(3.0, T=5.0)
-    for minute in (*range(4, 30), 24 * 60 + 3, 24 * 60 + 4):
-        desk.point(float(minute))
-    figures = {item.time_ns: item for item in desk.messages(AlarmKpis)}
-    assert list(figures) == [to_time_ns(minute) for minute in (*range(30), 24 * 60 + 3, 24 * 60 + 4)]
-    assert [figures[to_time_ns(minute)].alarms_10min for minute in (2, 3, 12, 13)] == [0, 1, 1, 0]
-    assert [list(figures[to_time_ns(minute)].stale) for minute in (24 * 60 + 3, 24 * 60 + 4)] == [[], ["shewhart/T"]]
-
-
 def test_an_alarm_that_there_is_no_more_is_left_out() -> None:
     desk = Desk(signals=("T",))
     desk.board.restore(stored(busy_desk()))
     assert [alarm.alarm for alarm in desk.board.all_alarms()] == ["shewhart/T"]
     assert desk.alarm().memory.state is State.ACKNOWLEDGED
-
-
-def test_bytes_that_were_cut_anywhere_are_refused() -> None:
-    data = busy_desk().board.memory.to_bytes()
-    for length in range(len(data)):
-        with pytest.raises(ValueError, match=r"^not a AnnunciatorMemory: "):
-            AnnunciatorMemory.from_bytes(data[:length])
-
-
-@given(st.data())
-@settings(max_examples=300)
-def test_bytes_that_were_changed_anywhere_are_refused_or_harm_nothing(data: st.DataObject) -> None:
-    changed = bytearray(busy_desk().board.memory.to_bytes())
-    for _ in range(data.draw(st.integers(1, 3))):
-        changed[data.draw(st.integers(0, len(changed) - 1))] = data.draw(st.integers(0, 255))
-    desk = Desk()
-    try:
-        desk.board.restore(AnnunciatorMemory.from_bytes(bytes(changed)))
-    except ValueError:
-        return
-    for minute in range(2, 6):
-        desk.point(minute, T=OUT if minute % 2 else IN, C=IN)
-    desk.board.all_alarms()
-    desk.board.memory.to_bytes()
 
 
 def test_a_state_that_cannot_be_is_refused_and_changes_nothing() -> None:

@@ -14,10 +14,10 @@ from monitor_node.causes.stage import START_STEPS, START_STEPS_A_ROW, Reconstruc
 from monitor_node.causes.window import Row
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
-from monitor_node.learn.signal_range import signal_ranges
+from monitor_node.watched_process import signal_ranges
 from reactorwatch.contract.codec import Encoded
 from reactorwatch.contract.messages_pb2 import Alarm, Incident, Sample
-from reactorwatch.kalman.batch import STEPS_PER_RUN, STEPS_PER_SEARCH, BudgetExceededError, StepBudget
+from reactorwatch.kalman.batch import BudgetExceededError, StepBudget, StepCost
 from reactorwatch.kalman.ekf import Filter
 from reactorwatch.process.library.cstr import cstr
 
@@ -106,7 +106,7 @@ def test_no_run_of_bad_values_fails_or_exceeds_the_budget_and_a_restart_over_it_
     assert again.failures.by_stage == {}
     assert [item.SerializeToString() for item in repeated] == [item.SerializeToString() for item in alarms]
     limit = LOOK_STEPS + LOOK_STEPS_A_ROW * CONFIG.isolation_rows
-    assert max(looks, default=0) <= limit + STEPS_PER_SEARCH + max(STEPS_PER_RUN, CONFIG.isolation_rows)
+    assert max(looks, default=0) <= limit + StepCost.SEARCH + max(StepCost.RUN, CONFIG.isolation_rows)
 
 
 def test_a_search_that_stopped_names_no_cause_and_the_incident_states_it(
@@ -153,7 +153,7 @@ def test_the_start_of_a_reconstruction_has_a_budget() -> None:
         found = Reconstruction(cstr(), SENSORS, ReconstructionMemory("T", "", [math.nan]))
         found.start(rows, rows[30][0])
     assert (
-        0 < sum(steps) - START_STEPS - START_STEPS_A_ROW * len(rows) <= STEPS_PER_SEARCH + STEPS_PER_RUN
+        0 < sum(steps) - START_STEPS - START_STEPS_A_ROW * len(rows) <= StepCost.SEARCH + StepCost.RUN
     )  # it stopped there
     time_min, flow, measured = rows[-1]
     found.update(time_min + 0.1, flow, measured)

@@ -5,7 +5,7 @@ import pytest
 
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
-from monitor_node.fleet.monitor import FleetMonitor
+from monitor_node.fleet import FleetMonitor
 from monitor_node.learn.training_diagnosis import FAILED, DiagnosisJob, Finding
 from reactorwatch.contract.codec import Encoded, Publication
 from reactorwatch.contract.messages_pb2 import Sample
@@ -67,14 +67,6 @@ def watched(runs: dict[str, list[Encoded]], queue: Queue) -> FleetMonitor:
     return monitors
 
 
-def test_each_training_is_submitted_once(runs: dict[str, list[Encoded]]) -> None:
-    queue = Queue()
-    monitors = watched(runs, queue)
-    publish(monitors, part(runs, 0, FOUND))
-    assert sorted(name for name, _ in queue) == sorted(runs)
-    assert all(len(job.rows.times_ns) == 400 for _, job in queue)
-
-
 def test_a_fleet_publishes_of_each_plant_what_its_own_monitor_does(runs: dict[str, list[Encoded]], warm: Run) -> None:
     queue = Queue()
     monitors = watched(runs, queue)
@@ -109,17 +101,6 @@ def test_a_diagnosis_that_is_pending_at_a_restart_is_submitted_again(runs: dict[
     published += publish(second, part(runs, FOUND))
     for name, run in runs.items():
         assert of(name, published) == of(name, own_monitor(name, run, dict(findings(after, warm))[name]))
-
-
-def test_a_change_after_the_diagnosis_survives_a_restart(runs: dict[str, list[Encoded]], warm: Run) -> None:
-    queue, after = Queue(), Queue()
-    first = watched({"warm": runs["warm"]}, queue)
-    published = publish(first, runs["warm"][:FOUND])
-    first.on_finding("warm", warm.finding)
-    published += publish(first, runs["warm"][FOUND : FOUND + 90])
-    published += publish(restart(first, after), runs["warm"][FOUND + 90 :])
-    assert not after
-    assert of("warm", published) == of("warm", own_monitor("warm", runs["warm"], warm.finding))
 
 
 def test_a_diagnosis_that_failed_leaves_its_plant_and_the_others_as_they_are(

@@ -7,15 +7,12 @@ import msgspec
 import pytest
 
 from monitor_node.core import Monitor
-from monitor_node.fleet.config import FleetConfig
-from monitor_node.fleet.monitor import EVICT_NS
+from monitor_node.fleet import EVICT_NS, FleetConfig
 from monitor_node.node import POLL_NS, MonitorNode
-from monitor_node.storage.state_files import CLAIM
-from reactorwatch.contract import keys
-from reactorwatch.contract.codec import Encoded, Publication, encode_message
-from reactorwatch.contract.messages_pb2 import Alarm, AlarmCommand, AlarmKpis
-from reactorwatch.runtime.metrics import Metrics
-from reactorwatch.runtime.security.command_rate import PER_NAME
+from monitor_node.state_files import CLAIM
+from reactorwatch.contract.codec import Encoded, Publication
+from reactorwatch.contract.messages_pb2 import Alarm, AlarmKpis
+from reactorwatch.runtime.http_pages import Metrics
 
 from ..fleets import PLANTS, QUICK, alarms, of, row_by_row, run_of
 
@@ -77,19 +74,6 @@ def test_the_state_of_a_plant_is_stored_as_soon_as_its_alarm_is_published(bench:
     after.node.on_stop(0)
 
 
-def test_a_flood_of_commands_is_refused(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
-    command = AlarmCommand(alarm="shewhart/T", by="Anna", comment="x")
-    question = Encoded("reactor/a/command/comment", *encode_message(command))
-    replies = [bench.node.on_command(question, bench.now_ns)[0] for _ in range(3000)]
-    refused = [reply for reply in replies if reply is not None and "too many commands" in reply.text]
-    assert len(refused) == 3000 - PER_NAME.at_once
-    assert bench.node.monitor("a").intake.rejects.by_reason["too_many_commands"] == len(refused)
-    for _ in range(101):
-        bench.tick()
-    assert f"too_many_commands ({len(refused)} so far)" in capsys.readouterr().out
-    assert bench.node.on_command(question._replace(key="reactor/b/command/comment"), bench.now_ns) == (None, [])
-
-
 def test_the_counts_and_alarms_of_each_plant_are_on_the_page_as_long_as_it_is_watched(bench: Bench) -> None:
     pytest.importorskip("prometheus_client", reason="prometheus-client (reactorwatch[metrics]) is not installed")
     metrics = bench.node.metrics = Metrics("monitor")
@@ -131,11 +115,3 @@ def test_alarm_kpis_are_published_from_the_first_alarm_of_a_plant_on() -> None:
     figures = [item for item in expected[first:] if isinstance(item.message, AlarmKpis)]
     assert len(figures) > 1
     assert [item for item in said if isinstance(item.message, AlarmKpis)] == figures
-
-
-def test_a_monitor_of_a_plant_alone_is_reported(bench: Bench, capsys: pytest.CaptureFixture[str]) -> None:
-    bench.node.on_alive(keys.monitor_token("a", "00-0f"), True, bench.now_ns)
-    assert "another monitor watches this plant" in capsys.readouterr().out
-    bench.node.on_alive("reactor/a/alive/monitor", True, bench.now_ns)
-    bench.node.on_alive(keys.monitor_token("a", "00-0f"), False, bench.now_ns)
-    assert "another monitor" not in capsys.readouterr().out

@@ -9,8 +9,7 @@ import pytest
 
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
-from monitor_node.fleet.config import FleetConfig
-from monitor_node.fleet.monitor import FleetMonitor, load_kinds
+from monitor_node.fleet import FleetConfig, FleetMonitor, load_kinds
 from monitor_node.watched_process import load_process
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record

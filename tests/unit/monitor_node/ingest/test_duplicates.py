@@ -1,11 +1,13 @@
-"""A resumed monitor takes each sample of its plant's history that it had not processed, and no other."""
+"""A resumed monitor takes each sample of its plant's history that it had not processed, and no other.
+
+The filter of samples that were processed before a restart.
+"""
 
 from copy import deepcopy
 
 import pytest
 
-from monitor_node.ingest.alignment import Aligner
-from monitor_node.ingest.duplicates import AlignmentMemory, ReplayFilter
+from monitor_node.ingest.rows import Aligner, AlignmentMemory, ReplayFilter
 
 PERIOD = 100
 SIGNALS = ("C", "T")
@@ -89,3 +91,17 @@ def test_the_filter_keeps_its_place_while_the_alignment_continues() -> None:
     memory.emitted[29 * PERIOD][T] = None
     assert found.is_duplicate(T, 29 * PERIOD, 29)
     assert not found.is_duplicate(T, 400 * PERIOD, 400)
+
+
+def test_the_filter_is_over_once_each_signal_has_passed_what_the_state_has() -> None:
+    aligner = Aligner(("qc", "T"), 5)
+    for number in range(3):
+        for signal in ("qc", "T"):
+            aligner.update(signal, 100 * number, number, 1.0)
+    replay_filter = ReplayFilter(aligner.memory)
+    assert all(replay_filter.is_duplicate(index, 100 * number, number) for number in range(3) for index in range(2))
+    assert not any(replay_filter.is_duplicate(0, 100 * number, number) for number in (3, 4))
+    assert not replay_filter.is_over  # T may still be repeated
+    assert replay_filter.is_duplicate(1, 200, 2)
+    assert not any(replay_filter.is_duplicate(1, 100 * number, number) for number in (3, 4))
+    assert replay_filter.is_over

@@ -7,7 +7,7 @@ import pytest
 
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
-from monitor_node.ingest.samples import RejectCounter, SampleUnits, UnusableSamples, reject_reason
+from monitor_node.ingest.intake import RejectCounter, SampleUnits, UnusableSamples, reject_reason
 from monitor_node.replay.backtest import run
 from monitor_node.watched_process import watch_process
 from reactorwatch.contract.codec import encode

@@ -8,7 +8,8 @@ import pytest
 
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
-from monitor_node.learn.black_box_reference import COPY_ROWS, BlackBoxReference
+from monitor_node.learn.black_box_reference import BlackBoxReference
+from monitor_node.learn.references import COPY_ROWS
 from monitor_node.replay import backtest
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication, encode
@@ -54,18 +55,6 @@ def test_a_row_in_one_compiled_step_gives_what_it_gives_stage_by_stage(leak: lis
     assert raised
     assert stepped.to_bytes() == staged.to_bytes()
     assert stepped.pipeline.reference == "black-box"
-
-
-@pytest.mark.parametrize("row", [650, 1090, 1140])
-def test_a_monitor_resumes_bit_for_bit_before_and_in_an_alarm(leak: list[Encoded], row: int) -> None:
-    first = Monitor(BLACK_BOX, 0)
-    for message in leak[: 3 * row]:
-        first.on_message(message, 0)
-    second = Monitor(BLACK_BOX, 0)
-    second.from_bytes(first.to_bytes())
-    for message in leak[3 * row :]:
-        assert second.on_message(message, 0) == first.on_message(message, 0)
-    assert second.to_bytes() == first.to_bytes()
 
 
 def test_nothing_is_learned_while_an_alarm_is_active_and_what_was_learned_last_is_taken_back(

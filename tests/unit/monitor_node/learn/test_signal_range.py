@@ -12,7 +12,7 @@ from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from monitor_node.learn.black_box_reference import BlackBoxReference
 from monitor_node.learn.process_reference import ProcessReference
-from monitor_node.learn.signal_range import ANY, signal_ranges
+from monitor_node.watched_process import ANY, signal_ranges
 from reactorwatch.contract.codec import Encoded, Publication
 from reactorwatch.contract.messages_pb2 import Alarm, Sample
 from reactorwatch.process.library.cascaded_tanks import tanks

@@ -175,10 +175,10 @@ def test_only_models_that_the_catalogue_makes_are_diagnosed() -> None:
 def test_a_backtest_judges_a_sound_plant_by_what_it_was_before(warm: Run) -> None:
     found, given = backtest.run(warm.messages, CONFIG), backtest.run(warm.messages, GIVEN)
     assert found.baseline is not None
-    assert found.baseline.time_ns == found.watching_since_ns
+    assert found.baseline.from_min == found.trained_until_min
     assert given.baseline is None
     assert not found.raised_alarms
-    assert given.rows == found.rows
+    assert given.samples == found.samples
 
 
 def test_the_alarms_of_a_nominal_plant_are_the_same_with_the_diagnosis_and_without() -> None:

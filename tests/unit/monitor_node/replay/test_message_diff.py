@@ -291,8 +291,3 @@ def test_the_same_values_in_another_order_of_the_fields_are_equal() -> None:
     diff.add_replayed([Publication(CHART, message)])
     diff.finish()
     assert (diff.differing, diff.counts[keys.CHART].equal) == (0, 1)
-
-
-def test_a_blank_at_the_end_of_a_text_is_a_difference() -> None:
-    (found,) = differences(keys.ALARM, Alarm(text="T is high"), Alarm(text="T is high "))
-    assert found[2:] == ("text", "'T is high'", "'T is high '")

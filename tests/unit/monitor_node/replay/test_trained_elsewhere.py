@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from monitor_node.config import MonitorConfig
-from monitor_node.replay.backtest import Backtest, RowLog, TrainedPlant, rows_of_file, run, train
+from monitor_node.replay.backtest import RowLog, TrainedPlant, rows_of_file, run, train
 from reactorwatch.errors import InputError
+from reactorwatch.results.backtest import Backtest
 
 from ..samples import Rows, leaking_run, samples
 
@@ -36,7 +37,7 @@ def test_each_row_of_another_record_is_judged_and_its_fault_found(
     assert trained.rows == sound[0].size
     result = judged(trained, config, leaking)
     assert result.watching_since_ns == result.first_ns == 0
-    assert (result.rows, result.training_rows) == (leaking[0].size, sound[0].size)
+    assert (result.samples, result.training_rows) == (leaking[0].size, sound[0].size)
     assert result.raised_alarms
     assert all(alarm.raised_ns >= ONSET_MIN * 60e9 for alarm, _ in result.raised_alarms)
     assert not judged(trained, config, leaking_run(0.0, 0.0, SPAN_MIN, 3)).raised_alarms

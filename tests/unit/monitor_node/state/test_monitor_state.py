@@ -1,4 +1,7 @@
-"""A monitor that resumes from its stored state publishes what it would have published, value for value."""
+"""A monitor that resumes from its stored state publishes what it would have published, value for value.
+
+A stored state names the build that stored it.
+"""
 
 import random
 from itertools import chain
@@ -9,14 +12,25 @@ import pytest
 
 from monitor_node.config import ChartName, MonitorConfig
 from monitor_node.core import Monitor
-from monitor_node.monitor_state import MAGIC, SEAL, ForeignFileError, OtherSettingsError
+from monitor_node.monitor_state import (
+    MAGIC,
+    VERSION,
+    ForeignFileError,
+    MonitorState,
+    OtherSettingsError,
+    learning_settings,
+    open_seal,
+    open_state,
+    seal,
+)
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, encode, encode_message
 from reactorwatch.contract.messages_pb2 import AlarmCommand, Health, ShelveAlarm
 from reactorwatch.errors import InputError
 from reactorwatch.process.library.cstr import cstr
+from reactorwatch.version import this_build
 
-from ..samples import PLANT, leaking_run, sample, samples
+from ..samples import PLANT, leaking_run, samples
 
 ALL_CHARTS: tuple[ChartName, ...] = (
     "shewhart", "ewma", "cusum", "t2", "mewma", "pca_t2", "pca_spe", "parameters",
@@ -89,17 +103,10 @@ def test_a_monitor_stopped_at_any_samples_publishes_the_same(
     assert len(events) > 3
 
 
-def test_a_state_that_was_resumed_from_is_the_same_bytes(leak: list[Encoded]) -> None:
-    monitor, again = Monitor(CONFIG, 0), Monitor(CONFIG, 0)
-    run(monitor, leak, 0, 2400)
-    again.from_bytes(monitor.to_bytes())
-    assert again.to_bytes() == monitor.to_bytes()
-
-
-@pytest.mark.parametrize("version", [*range(2, SEAL.version), SEAL.version + 1])
+@pytest.mark.parametrize("version", [*range(2, VERSION), VERSION + 1])
 def test_a_state_of_another_layout_is_refused_in_one_line(version: int) -> None:
-    stored = SEAL._replace(version=version).close(SEAL.open(Monitor(CONFIG, 0).to_bytes()))
-    text = f"is the state of a monitor in version {version}, this software reads {SEAL.version}"
+    stored = seal(open_seal(Monitor(CONFIG, 0).to_bytes()), version)
+    text = f"is the state of a monitor in version {version}, this software reads {VERSION}"
     with pytest.raises(InputError, match=f"^{text}$"):
         Monitor(CONFIG, 0).from_bytes(stored)
 
@@ -123,7 +130,7 @@ def wrong(stored: bytes) -> list[tuple[str, bytes, str]]:
     """What is no state of ours, and what is said of it."""
     damaged = bytearray(stored)
     damaged[len(stored) // 2] ^= 1
-    newer = MAGIC + (SEAL.version + 1).to_bytes(2, "big") + stored[len(MAGIC) + 2 :]
+    newer = MAGIC + (VERSION + 1).to_bytes(2, "big") + stored[len(MAGIC) + 2 :]
     return [
         ("empty", b"", "is no state of a monitor: 0 bytes"),
         ("foreign", b"\x89PNG and so on", "is no state of a monitor: 14 bytes"),
@@ -133,7 +140,7 @@ def wrong(stored: bytes) -> list[tuple[str, bytes, str]]:
         (
             "of another version",
             newer,
-            f"is the state of a monitor in version {SEAL.version + 1}, this software reads {SEAL.version}",
+            f"is the state of a monitor in version {VERSION + 1}, this software reads {VERSION}",
         ),
     ]
 
@@ -207,18 +214,6 @@ def test_samples_that_were_received_before_the_stop_are_counted_and_change_nothi
     assert duplicated(again) == SIGNALS * rows_again
 
 
-def test_a_sample_that_was_missing_at_the_stop_is_taken_when_it_comes_again() -> None:
-    messages = list(samples(*leaking_run(0.0, 1.0, 3.0, seed=1)))
-    monitor, again = Monitor(CONFIG, 0), Monitor(CONFIG, 0)
-    for message in messages[: SIGNALS * 20 + 2]:  # T of the last row is missing
-        monitor.on_message(message, 0)
-    again.from_bytes(monitor.to_bytes())
-    for message in messages[SIGNALS * 10 : SIGNALS * 21]:
-        again.on_message(message, 0)
-    assert again.rows == 21
-    assert duplicated(again) == SIGNALS * 10 + 2
-
-
 @pytest.mark.parametrize("rows", [1, 2])
 @pytest.mark.parametrize("told_again", [True, False])
 def test_a_stop_while_samples_are_held_back_after_a_pause_loses_none(rows: int, told_again: bool) -> None:
@@ -234,31 +229,6 @@ def test_a_stop_while_samples_are_held_back_after_a_pause_loses_none(rows: int, 
     said = run(again, messages, place - 30 if told_again else place, len(messages))
     assert list(chain.from_iterable(said)) == list(chain.from_iterable(whole[place:]))
     assert again.rows == len(messages) // SIGNALS
-
-
-def test_a_plant_that_restarted_meanwhile_is_accepted(leak: list[Encoded]) -> None:
-    """Its clock was set back and it counts from 0: what it says of times that were heard has other numbers."""
-    monitor, again = Monitor(CONFIG, 0), Monitor(CONFIG, 0)
-    run(monitor, leak, 0, 2300)
-    again.from_bytes(monitor.to_bytes())
-    rows = again.rows
-    assert again.memory.last_ns is not None
-    begin_min = again.memory.last_ns / 60e9 - 1.0
-    for row in range(50):
-        for signal, value in (("qc", 100.0), ("C", 0.1), ("T", 438.5)):
-            again.on_message(sample(signal, row, begin_min + row / 10, value), 0)
-    assert again.rows >= rows + 40
-
-
-def test_a_sample_far_ahead_before_the_history_judges_no_row_twice(leak: list[Encoded]) -> None:
-    """Another publisher sent it; the history of its signal comes after it."""
-    monitor, again = Monitor(CONFIG, 0), Monitor(CONFIG, 0)
-    run(monitor, leak, 0, 1500)
-    again.from_bytes(monitor.to_bytes())
-    assert again.memory.last_ns is not None
-    again.on_message(sample("T", 1_000_000, again.memory.last_ns / 60e9 + 60.0, 438.5), 0)
-    run(again, leak, 0, 1500)
-    assert again.rows == monitor.rows
 
 
 def test_after_the_history_a_plant_that_repeats_itself_is_accepted() -> None:
@@ -290,10 +260,14 @@ def test_a_plant_that_publishes_nothing_after_the_stop_is_silent(leak: list[Enco
     assert [item.key for item in said if "/alarm/" in item.key] == [keys.key(PLANT, keys.ALARM, "silence/plant")]
 
 
-def test_the_rows_of_a_fault_under_search_continue(leak: list[Encoded]) -> None:
-    """A state in the middle of an isolation remembers how far it has come: the suspects are the same, bit for bit."""
-    config = MonitorConfig(training_min=60.0)
-    whole = [item for told in run(Monitor(config, 0), leak, 0, len(leak)) for item in told if "/alarm/" in item.key]
-    places = [SIGNALS * place for place in (701, 712, 720, 735, 760)]
-    again = [item for told in stopped_at(places, leak, config) for item in told if "/alarm/" in item.key]
-    assert again == whole
+def test_a_state_names_the_build_that_stored_it_and_its_refusal_names_another_build() -> None:
+    monitor = Monitor(CONFIG, 0, points=False)
+    settings = learning_settings(CONFIG, monitor.pipeline.model, points=False)
+    data = monitor.to_bytes()
+    assert MonitorState.from_bytes(open_seal(data)).build == this_build()
+    other = msgspec.structs.replace(open_state(data, settings), build="0.2.0 (commit 0123456789ab)").to_bytes()
+    assert open_state(seal(other), settings).settings == settings
+    with pytest.raises(OtherSettingsError, match=r"learned by 0\.2\.0 \(commit 0123456789ab\) with other settings"):
+        open_state(seal(other), settings | {"training_min": 7.0})
+    with pytest.raises(OtherSettingsError, match=r"^was learned with other settings"):
+        open_state(data, settings | {"training_min": 7.0})

@@ -8,13 +8,12 @@ from pathlib import Path
 
 import pytest
 
+from monitor_node import state_files as claims
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
-from monitor_node.fleet.config import FleetConfig
+from monitor_node.fleet import FleetConfig
 from monitor_node.node import MonitorNode
-from monitor_node.storage import claims
-from monitor_node.storage.claims import Claim, is_local
-from monitor_node.storage.state_files import CLAIM, StateStore
+from monitor_node.state_files import CLAIM, Claim, StateStore, is_local
 from reactorwatch.contract.codec import Encoded
 from reactorwatch.contract.messages_pb2 import Alarm
 from reactorwatch.errors import InputError, is_passing
@@ -24,7 +23,7 @@ from ..fleets import QUICK, run_of
 HOLDER = """
 import sys, time
 from pathlib import Path
-from monitor_node.storage.claims import Claim
+from monitor_node.state_files import Claim
 claim = Claim(Path(sys.argv[1]), "it")
 print("claimed", claim.failure, flush=True)
 time.sleep(600)

@@ -12,9 +12,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from monitor_node.config import MonitorConfig
-from monitor_node.fleet.config import FleetConfig
+from monitor_node.fleet import FleetConfig
 from monitor_node.node import MonitorNode
-from monitor_node.storage.state_files import CLAIM, StateStore, find_kept_aside, keep_aside
+from monitor_node.state_files import CLAIM, StateStore, find_kept_aside, keep_aside
 from reactorwatch.contract.codec import Encoded
 from reactorwatch.contract.messages_pb2 import Alarm, AlarmState
 from reactorwatch.errors import InputError
@@ -70,17 +70,6 @@ def test_settings_changed_and_changed_back_cost_no_row(
         node.on_stop(0)
         learned[number] = own(node).rows
     assert len(files(folder)) == len(set(starts))
-
-
-def test_an_empty_state_is_not_written_over_one_that_was_kept(tmp_path: Path, rows: list[Encoded]) -> None:
-    """The case of issue 23: two starts with other settings and no sample, then the old settings again."""
-    node = start_node(config(tmp_path), 0)
-    for message in rows:
-        node.on_message(message, 0)
-    node.on_stop(0)
-    for order in (2, 4):
-        start_node(config(tmp_path, order=order), 0)
-    assert own(start_node(config(tmp_path), 0)).rows == len(rows) // 3
 
 
 def test_each_damaged_file_is_kept(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -2,7 +2,6 @@
 
 from functools import lru_cache
 
-import numpy as np
 import pytest
 
 from monitor_node.config import MonitorConfig
@@ -10,7 +9,7 @@ from monitor_node.replay import backtest
 from plant_node.config import PlantConfig
 from plant_node.record import simulate_record
 from reactorwatch.contract.codec import Encoded, encode
-from reactorwatch.contract.messages_pb2 import Power
+from reactorwatch.results.promise import Power
 from recorder.tools.player import samples_of
 
 FACTOR, RUNS, HORIZON_MIN, ONSET_MIN = 1.3, 8, 10.0, 5.0
@@ -45,8 +44,7 @@ def stated(reference: str) -> dict[tuple[str, str], Power]:
     """Deviations that would be seen; without the search for causes they are biases of outputs with equations, too."""
     quick = settings(reference, isolation=True)
     result = backtest.run(messages(30, 2), quick, trained=trained(reference, isolation=True))
-    assert result.promise is not None
-    return {(item.deviation, item.profile): item for item in result.promise.power}
+    return {(item.deviation, item.profile): item for item in result.power}
 
 
 def share_seen(reference: str, cause: str, size: float) -> float:
@@ -65,15 +63,18 @@ def share_seen(reference: str, cause: str, size: float) -> float:
 def test_a_step_of_the_stated_size_is_seen_in_time_to_within_a_factor(reference: str, cause: str) -> None:
     """A larger one in nine of ten runs and more; a smaller one is missed now and then."""
     size = stated(reference)[cause, ""].within_10_min
+    assert size is not None
     assert share_seen(reference, cause, FACTOR * size) >= 0.9
     assert share_seen(reference, cause, size / FACTOR) <= 0.9
 
 
 def test_longer_horizons_show_smaller_deviations_and_a_ramp_has_the_sizes_of_a_day() -> None:
     for (_, profile), item in stated("equations").items():
-        if item.HasField("within_10_min"):
+        if item.within_10_min is not None:
+            assert item.within_1_h is not None
+            assert item.within_1_day is not None
             assert item.within_10_min > item.within_1_h > item.within_1_day > 0.0
-        assert not profile or not item.HasField("within_10_min") or item.within_10_min > 50.0 * item.within_1_day
+            assert not profile or item.within_10_min > 50.0 * item.within_1_day
 
 
 def test_every_cause_that_alarms_are_traced_to_is_stated_as_step_and_ramp() -> None:
@@ -89,4 +90,4 @@ def test_without_equations_biases_of_the_outputs_are_stated_in_their_units(refer
     found = stated(reference)
     assert {name for name, _ in found} == {"C.bias", "T.bias"}
     assert found["T.bias", ""].unit == "K"
-    assert np.isfinite(found["C.bias", "ramp"].within_1_day)
+    assert found["C.bias", "ramp"].within_1_day is not None

@@ -1,13 +1,144 @@
-"""False alarms are as many as promised, with noise that has a memory; `make faults` has more runs."""
+"""The promise is stated twice, checked by the training itself, and compared with the alarms that come.
+
+False alarms are as many as promised, with noise that has a memory; `make faults` has more runs.
+"""
 
 from collections import Counter
 
+import numpy as np
 import pytest
 
+import reactorwatch as rw
 from benchmarks.harness.bank import PERIOD_MIN, TRAINING_MIN, fault_free
 from benchmarks.harness.plants import messages_of
 from monitor_node.config import MonitorConfig
+from monitor_node.core import Monitor
 from monitor_node.replay import backtest
+from monitor_node.watch.promise import (
+    PlantPromise,
+    extrapolate_count,
+)
+from reactorwatch.contract.messages_pb2 import Promise
+from reactorwatch.records.record import Record
+
+from ..samples import leaking_run
+from ..watching import Watched, sound_run, watched
+
+QUICK = MonitorConfig(isolation=False, diagnose_training=False, training_min=60.0)
+ROWS_IN_30_DAYS = 432_000.0
+
+
+def promises(run: Watched) -> list[Promise]:
+    return [item.message for item in run.published if isinstance(item.message, Promise)]
+
+
+def wandering(growth: float = 2.5, seed: int = 4) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """A run whose noise grows by a factor in the middle of a training of 60 minutes; ten later the coolant leaks."""
+    time_min, columns = leaking_run(0.3, 70.0, 90.0, seed)
+    noisy = time_min >= 30.0
+    generator = np.random.default_rng(seed)
+    for name, sd in (("C", 0.002), ("T", 0.3)):
+        extra = generator.normal(size=time_min.size) * sd * np.sqrt(growth**2 - 1.0)
+        columns[name] = columns[name] + np.where(noisy, extra, 0.0)
+    return time_min, columns
+
+
+@pytest.fixture(scope="module")
+def sound() -> Watched:
+    return watched(*sound_run(80.0, seed=3), QUICK)
+
+
+@pytest.fixture(scope="module")
+def restless() -> Watched:
+    return watched(*wandering(), QUICK)
+
+
+def test_the_promise_is_published_when_the_training_ends_and_with_each_snapshot(sound: Watched) -> None:
+    published = promises(sound)
+    assert [round(item.time_ns / 60e9) for item in published] == [60, 61, 66, 71, 76]
+    assert {item.key for item in sound.published if isinstance(item.message, Promise)} == {
+        "reactor/cstr/promise/monitor"
+    }
+    assert published[0].expected == pytest.approx(1.0)
+    assert 1.0 < published[0].expected_90 < 10.0
+    assert published[-1].expected_so_far == pytest.approx(published[-1].rows / ROWS_IN_30_DAYS)
+
+
+def test_a_sound_plant_keeps_its_promise(sound: Watched) -> None:
+    last = promises(sound)[-1]
+    assert (last.kept, last.drifted, last.found, last.checked_rows) == (True, False, 0, 300)
+    assert last.can_keep_per_30_days == last.expected
+    assert last.expected_in_training == pytest.approx(300 / ROWS_IN_30_DAYS)
+
+
+def test_a_training_that_does_not_bear_the_promise_out_reports_it_and_the_rate_that_can_be_promised(
+    restless: Watched,
+) -> None:
+    first = promises(restless)[0]
+    assert not first.kept
+    assert first.can_keep_per_30_days > 10.0 * first.expected
+    assert "can be promised; train longer" in first.text
+    assert any(note.startswith("promise: in the second half of its training") for note in restless.monitor.notes)
+
+
+def test_an_alarm_of_such_a_plant_states_the_rate_of_false_alarms(restless: Watched) -> None:
+    raised = [item for item in restless.alarms if item.event == "raised"]
+    sound_one = watched(*leaking_run(0.2, 70.0, 80.0, seed=3), QUICK)
+    assert raised
+    assert all("by its training, false alarms of this plant may come 1 in " in item.text for item in raised)
+    assert not any("by its training" in item.text for item in sound_one.alarms)
+
+
+def test_alarms_are_counted_beside_those_promised() -> None:
+    run = watched(*leaking_run(0.2, 70.0, 90.0, seed=3), QUICK)
+    last = promises(run)[-1]
+    chance = ("shewhart", "ewma", "mewma", "spike", "stuck")
+    assert last.found == sum(name.split("/")[0] in chance for name, _ in run.raised) > 0
+    assert "since, 0.0" in last.text
+
+
+def test_a_plant_that_resumes_from_its_state_has_the_same_promise(restless: Watched) -> None:
+    resumed = Monitor(QUICK, 0)
+    resumed.from_bytes(restless.monitor.to_bytes())
+    assert resumed.promise == restless.monitor.promise
+    assert resumed.promise is not None
+    assert not resumed.promise.kept
+
+
+def test_more_events_than_chance_explains_mean_that_the_plant_has_drifted() -> None:
+    promise = PlantPromise(1.0, 2.0, ROWS_IN_30_DAYS)
+    for row in (100, 110, 1000):
+        promise.count_alarms(2, row)
+    assert (promise.found, promise.events, promise.has_drifted(1100)) == (6, 2, False)
+    promise.count_alarms(1, 2000)
+    assert promise.has_drifted(2100)
+    assert "has drifted from its training" in promise.text(2100)
+    assert not promise.has_drifted(int(2 * ROWS_IN_30_DAYS))  # four are promised until then
+
+
+def test_counts_at_other_limits_follow_from_a_common_factor_of_the_residuals() -> None:
+    """Limits 1.2 times too tight: run lengths are A^(1 / 1.44)."""
+    found = 4500.0 / 1500.0 ** (1 / 1.44)
+    assert extrapolate_count(round(found), 1500.0, 4500.0, 1e6) == pytest.approx(4500.0 / 1e6 ** (1 / 1.44), rel=0.1)
+
+
+def test_a_back_test_has_the_promise_for_the_rows_it_judged() -> None:
+    time_min, columns = sound_run(80.0, seed=3)
+    found = rw.backtest(Record(time_min, columns, "sound"), training_min=60.0, isolation=False, diagnose_training=False)
+    assert found.promise is not None
+    assert found.promise.expected == found.expected_false_alarms
+    assert found.promise.expected < found.promise.expected_90 < 0.01
+    stated = found.to_dict()["promise"]
+    assert {"checked_rows", "found_in_training", "expected_in_training", "kept", "can_keep_per_30_days"} < stated.keys()
+    assert stated["text"] == found.promise["text"]
+    assert f"promise: {found.promise.text}" in str(found)
+
+
+def test_before_rows_are_judged_there_is_no_promise() -> None:
+    time_min, columns = sound_run(50.0, seed=3)
+    found = rw.backtest(Record(time_min, columns, "short"), training_min=60.0, diagnose_training=False)
+    assert (found.promise, found.power) == (None, [])
+
 
 RUNS, ROWS, PER_30_DAYS = 16, 5000, 1000.0
 

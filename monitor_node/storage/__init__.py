@@ -1,1 +1,0 @@
-"""Files of stored states and alarms."""

@@ -1,0 +1,1 @@
+"""Results as structs whose fields are those of the JSON that commands print."""

@@ -1,1 +1,0 @@
-"""Access rules, certificates, provisioning of a site, limits and audit of commands."""

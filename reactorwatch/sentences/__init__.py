@@ -1,0 +1,1 @@
+"""Sentences of results and alarms, for the terminal, pages, notebooks, logs and the bus alike."""

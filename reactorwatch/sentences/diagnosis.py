@@ -1,0 +1,308 @@
+"""A diagnosis in words: its verdict, causes, law and errors in sentences, and all of it as lines for a terminal."""
+
+from collections.abc import Sequence
+from math import floor, isfinite, log10
+from typing import TYPE_CHECKING
+
+import numpy as np
+from msgspec.structs import replace
+
+from reactorwatch.process import LOCATION_PHRASES
+from reactorwatch.process.effect import Effect
+from reactorwatch.terminal import printable_lines
+
+if TYPE_CHECKING:
+    from reactorwatch.diagnosis.difference import Difference
+    from reactorwatch.diagnosis.result import AdjustedParameter, Cause, Curves, Diagnosis, Estimate, HeldOut, Law
+
+INDENT = 14
+
+TIME = "time"  # the axis of time in a difference
+
+MOSTLY_NOISE, WORSE = 0.9, 1.2
+"""Noise share above which no range is named; error of a range, relative to all rows, above which it is named."""
+
+
+def describe_verdict(diagnosis: "Diagnosis") -> str:
+    """Verdict in a sentence or two."""
+    off = [name for name, item in diagnosis.parameters.items() if item.differs]
+    if diagnosis.verdict == "nominal" and off:
+        return (
+            f"The simulation is right within what was stated of its parameters: {' and '.join(off)} "
+            f"{'is' if len(off) == 1 else 'are'} a little off, and the rest of the record is noise."
+        )
+    if diagnosis.verdict == "nominal":
+        return "The simulation is right: the rest of the record is noise."
+    matters = describe_significance(diagnosis)
+    if diagnosis.verdict == "ambiguous":
+        explanations = [diagnosis.causes, *(item.explanation for item in diagnosis.alternatives)]
+        names = [" with ".join(f"{item.label} ({describe_timing(item)})" for item in causes) for causes in explanations]
+        return f"The simulation is wrong, and the record cannot tell why: {' or '.join(names)}. {matters}"
+    if diagnosis.verdict == "named":
+        causes = [f"{cause.label}, {describe_timing(cause, diagnosis.curves)}" for cause in diagnosis.causes]
+        return f"The simulation is wrong: {'; and '.join(causes)}. {matters}"
+    text = f"The simulation is wrong, and no known cause explains it; it acts {describe_location(diagnosis)}."
+    if diagnosis.law is not None:
+        text += f" A law explains it: {diagnosis.law.formula}, {diagnosis.law.term}."
+    return f"{text} {matters}"
+
+
+def describe_training(diagnosis: "Diagnosis") -> str:
+    """Deviation of a plant's training from its equations, in a sentence."""
+    if diagnosis.verdict == "nominal":
+        return "the training agrees with the equations"
+    if not diagnosis.causes:
+        where = diagnosis.location
+        return f"the training deviates from the equations ({where}), and no cause of the catalogue explains it"
+    text = f"the training deviates from the equations by {_join_sizes(diagnosis.causes)}"
+    others = ", or ".join(_join_sizes(item.explanation) for item in diagnosis.alternatives)
+    return f"{text}; its rows do not rule out {others}" if diagnosis.verdict == "ambiguous" else text
+
+
+def _join_sizes(causes: Sequence["Cause"]) -> str:
+    """Causes with their sizes as numbers."""
+    texts = []
+    for cause in causes:
+        size = cause.parameters["size"]
+        unit = "" if size.unit == "1" else f" {size.unit}"
+        texts.append(
+            f"{cause.label} ({cause.cause}) in the course of a curve, which predicts no other rows"
+            if cause.profile == "free"
+            else f"{cause.label} ({cause.cause}, {cause.profile}) of {size.value:+.3g}{unit}"
+        )
+    return " and ".join(texts)
+
+
+def law_rows(law: "Law") -> list[tuple[str, str]]:
+    """Facts about a law, each with its name."""
+    unit = "" if law.unit == "1" else f", in {law.unit}"
+    rows = [("law", f"{law.formula}{unit}, {law.term}")]
+    rows += [(name, f"{format_interval(item)}  (95 %)") for name, item in law.parameters.items()]
+    for name, item in law.correlations.items():
+        rows.append(
+            (name, f"would have the correlation {item.correlation:.2f} with {item.parameter}, if that were uncertain")
+        )
+    ranges = ", ".join(f"{name} from {low:.4g} to {high:.4g}" for name, (low, high) in law.range.items())
+    rows.append(("range", f"seen with {ranges}; it need not hold outside"))
+    rows += [
+        ("or", f"{item.formula} ({item.form}, {describe_place(item.location)}), worse by {item.delta_bic:.1f} in BIC")
+        for item in law.rivals
+    ]
+    return rows
+
+
+def describe_significance(diagnosis: "Diagnosis") -> str:
+    """Practical significance."""
+    return "It matters in practice." if diagnosis.practical else "In practice the difference is too small to matter."
+
+
+def describe_location(diagnosis: "Diagnosis") -> str:
+    """Location of the deviation."""
+    if not diagnosis.location:
+        return "where this record does not tell"
+    return describe_place(diagnosis.location)
+
+
+def describe_place(location: str) -> str:
+    """Phrase of a location.
+
+    >>> describe_place("upper_tank")
+    'in the upper tank'
+    """
+    return LOCATION_PHRASES.get(location, f"in the {location.replace('_', ' ')}")
+
+
+def describe_timing(cause: "Cause", curves: "Curves | None" = None) -> str:
+    """Onset of a cause, or its profile in time."""
+    if cause.profile == "constant":
+        return "all the time"
+    if cause.profile == "sine":
+        return f"swinging with a period of {format_interval(cause.parameters['period'])}"
+    if cause.profile == "free":
+        largest = "" if curves is None else f", largest at {_largest_min(cause, curves):.4g} min"
+        return f"changing over the record{largest}"
+    since = f"since {format_interval(cause.parameters['onset'])}"
+    if (cause.run or 1) > 1:
+        since += f" of run {cause.run}"
+    if cause.profile == "ramp":
+        return f"growing {since}"
+    return f"settling {since}" if cause.profile == "decay" else since
+
+
+def describe_size(cause: "Cause", effects: Sequence[Effect]) -> str:
+    """Size of a cause with its 95 % interval, the part of the profile it belongs to, and constants of the effect.
+
+    Args:
+        cause: cause of an explanation.
+        effects: the catalogue, which has its meaning.
+    """
+    of_what = {"ramp": " at the end", "decay": " in the end", "sine": " to either side", "free": " at its largest"}
+    own = (item for effect in effects if effect.name == cause.cause for item in effect.constants)
+    constants = [f", {item.name} {format_interval(cause.parameters[item.name])}" for item in own]
+    return _describe_size(cause, effects) + of_what.get(cause.profile, "") + "".join(constants)
+
+
+def describe_explanation(causes: Sequence["Cause"], effects: Sequence[Effect]) -> str:
+    """Causes of an explanation, each with its size and onset."""
+    return " with ".join(
+        f"{item.label} ({item.cause}, {item.profile}): {describe_size(item, effects)}, {describe_timing(item)}"
+        for item in causes
+    )
+
+
+def _describe_size(cause: "Cause", effects: Sequence[Effect]) -> str:
+    size = cause.parameters["size"]
+    effect = next((item for item in effects if item.name == cause.cause), None)
+    if effect is None or not effect.larger:
+        return format_interval(size)
+    share = effect.is_share
+    amount = replace(size, value=100.0 * size.value, sd=100.0 * size.sd, unit="%") if share else size
+    if cause.profile == "sine":  # its sign has no meaning
+        return format_interval(amount)
+    text = effect.larger
+    if amount.value < 0.0 and effect.smaller:
+        text, amount = effect.smaller, replace(amount, value=-amount.value)
+    value, half = round_estimate(amount)
+    unit = "" if amount.unit == "1" else f" {amount.unit}"
+    return text.format(value) + (f" (± {half}{unit})" if half else "")
+
+
+def describe_causes(causes: Sequence[tuple[str, str]], effects: Sequence[Effect]) -> str:
+    """Causes of an explanation by their labels.
+
+    Args:
+        causes: (cause, profile) of each.
+        effects: the catalogue.
+    """
+    named = {effect.name: effect for effect in effects}
+    labels = []
+    for cause, profile in causes:
+        effect = named.get(cause)
+        label = cause if effect is None else effect.labels.get(profile, effect.label)
+        labels.append(f"{label} ({cause}, {profile})")
+    return " with ".join(labels)
+
+
+def format_interval(estimate: "Estimate") -> str:
+    """Estimate and half width of its 95 % interval, with the unit.
+
+    >>> from reactorwatch.diagnosis.result import Estimate
+    >>> format_interval(Estimate(-0.0499634, 8.5e-5, "1"))
+    '-0.04996 ± 0.00017'
+    >>> format_interval(Estimate(299.9, 0.0, "min"))
+    '299.9 min'
+    """
+    unit = "" if estimate.unit == "1" else f" {estimate.unit}"
+    value, half = round_estimate(estimate)
+    return f"{value} ± {half}{unit}" if half else f"{value}{unit}"
+
+
+def round_estimate(estimate: "Estimate") -> tuple[str, str]:
+    """Estimate and half width of its 95 % interval with equal decimals; the latter empty if it is not known.
+
+    The interval has one digit, or two if it begins with a 1.
+
+    >>> from reactorwatch.diagnosis.result import Estimate
+    >>> round_estimate(Estimate(14.998, 0.0127, "%"))
+    ('15.00', '0.02')
+    """
+    half = estimate.half_width
+    if not (isfinite(half) and half > 0.0):
+        return f"{estimate.value:.5g}", ""
+    first = floor(log10(half))
+    decimals = -first + (half < 2.0 * 10.0**first)
+    if decimals < 0:
+        return f"{round(estimate.value, decimals):.0f}", f"{round(half, decimals):.0f}"
+    return f"{estimate.value:.{decimals}f}", f"{half:.{decimals}f}"
+
+
+def describe_parameter(item: "AdjustedParameter") -> str:
+    """Estimate of an uncertain parameter, with its prior."""
+    return f"{format_interval(item.estimate)}; stated: {format_interval(item.prior)}"
+
+
+def format_error(value: float, unit: str) -> str:
+    """Root mean square error; none if the simulation diverged."""
+    return f"{value:.3g} {unit}" if isfinite(value) else "none, it ran away"
+
+
+def describe_holdout(name: str, item: "HeldOut", *, improved: bool) -> str:
+    """Error of the simulation on held-out rows, in one line."""
+    before = f", before {format_error(item.rmse_before, item.unit)}" if improved else ""
+    return f"{name} off by {format_error(item.rmse_after, item.unit)}{before}; noise {item.noise_sd:.3g} {item.unit}"
+
+
+def describe_difference(name: str, item: "Difference") -> str:
+    """Error of the simulation, its share of noise, and the ranges where it is largest, in a sentence."""
+    if not isfinite(item.rmse):
+        return f"{name}: the simulation ran away from the record."
+    text = f"{name}: the simulation errs by {item.rmse:.3g} {item.unit}, {_percent(item.noise_share)} of it noise"
+    if item.noise_share > MOSTLY_NOISE:
+        return f"{text}."
+    places = [
+        f"{'from' if axis == TIME else f'at {axis}'} {part.lower:.4g} to {part.upper:.4g} {unit} ({part.rmse:.3g})"
+        for axis, unit in item.units.items()
+        if (part := item.worst(axis)) is not None and part.rmse > WORSE * item.rmse
+    ]
+    return f"{text}; most {', '.join(places)}." if places else f"{text}; everywhere alike."
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.0f} %" if share >= 0.01 else "less than 1 %"
+
+
+def _largest_min(cause: "Cause", curves: "Curves") -> float:
+    return float(curves.time_min[int(np.argmax(np.abs(curves.deviation[cause.cause])))])
+
+
+def diagnosis_text(diagnosis: "Diagnosis", effects: Sequence[Effect]) -> str:
+    """Verdict, causes with their 95 % intervals, gain, alternatives and remarks.
+
+    Args:
+        diagnosis: diagnosis of a record.
+        effects: the catalogue.
+    """
+    lines = [f"{diagnosis.file}: {diagnosis.samples} rows over {diagnosis.span_min:g} min", describe_verdict(diagnosis)]
+    ambiguous = diagnosis.verdict == "ambiguous"
+    if ambiguous:
+        lines += [_line("either", f"{describe_explanation(diagnosis.causes, effects)}  (95 %)")]
+        lines += _alternatives(diagnosis, effects) + _experiment(diagnosis)
+    for cause in () if ambiguous else diagnosis.causes:
+        lines += [
+            _line("cause", f"{cause.label} ({cause.cause}, {cause.profile})"),
+            _line("size", f"{describe_size(cause, effects)}  (95 %)"),
+            _line("when", describe_timing(cause, diagnosis.curves)),
+        ]
+    if len(diagnosis.locations) > 1:
+        places = [f"{describe_place(item.location)} ({item.delta_bic:.1f})" for item in diagnosis.locations]
+        lines.append(_line("where", f"{', '.join(places)}: worse in BIC"))
+    if diagnosis.law is not None:
+        lines += [_line(name, text) for name, text in law_rows(diagnosis.law)]
+    if diagnosis.verdict != "nominal":
+        lines.append(_line("evidence", f"{diagnosis.gain.delta_bic:,.1f} in BIC over the simulation as it was"))
+        lines += [_line("differs", describe_difference(name, item)) for name, item in diagnosis.differences.items()]
+    for name, known in diagnosis.parameters.items():
+        lines.append(_line("parameter", f"{name} {describe_parameter(known)}  (95 %)"))
+    for name, item in diagnosis.gain.held_out.items():
+        lines.append(_line("held out", describe_holdout(name, item, improved=diagnosis.is_extended)))
+    if not ambiguous:
+        lines += _alternatives(diagnosis, effects) + _experiment(diagnosis)
+    if diagnosis.causes and not diagnosis.alternatives:
+        lines.append(_line("or", "nothing else in the catalogue comes near"))
+    lines += [_line("note", remark) for remark in diagnosis.remarks]
+    return printable_lines(lines)
+
+
+def _alternatives(diagnosis: "Diagnosis", effects: Sequence[Effect]) -> list[str]:
+    return [
+        _line("or", f"{describe_explanation(item.explanation, effects)}, worse by {item.delta_bic:.1f} in BIC")
+        for item in diagnosis.alternatives
+    ]
+
+
+def _experiment(diagnosis: "Diagnosis") -> list[str]:
+    return [] if diagnosis.experiment is None else [_line("experiment", diagnosis.experiment.why)]
+
+
+def _line(key: str, text: str) -> str:
+    return f"  {key:<{INDENT - 2}}{text}"
