@@ -20,8 +20,8 @@ from monitor_node.alarms.commands import execute_command
 from monitor_node.checks.signal_checks import SilenceCheck
 from monitor_node.config import MonitorConfig
 from monitor_node.health import HEARD_AGAIN_NS, NODE, STALL_NS, Failures, ReceiveStats
+from monitor_node.ingest.alignment import Row
 from monitor_node.ingest.intake import SampleIntake
-from monitor_node.ingest.rows import Row
 from monitor_node.ingest.sequence_check import SequenceCheck
 from monitor_node.learn.baseline import NO_VALUE
 from monitor_node.learn.training_diagnosis import DiagnosisJob, Finding

@@ -12,8 +12,8 @@ import msgspec
 
 from monitor_node.alarms.annunciator import AnnunciatorMemory
 from monitor_node.config import MonitorConfig
+from monitor_node.ingest.alignment import AlignmentMemory
 from monitor_node.ingest.intake import IntakeMemory
-from monitor_node.ingest.rows import AlignmentMemory
 from monitor_node.watch.pipeline import PipelineMemory
 from reactorwatch.errors import InputError
 from reactorwatch.process.model import ProcessModel, fingerprint
@@ -27,7 +27,7 @@ class ForeignFileError(InputError):
 
 
 MAGIC = b"reactorwatch monitor"
-VERSION = 9
+VERSION = 10
 """Version of the layout of the stored state."""
 
 

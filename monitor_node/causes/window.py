@@ -20,7 +20,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from monitor_node.ingest.rows import missing_rows
+from monitor_node.ingest.alignment import missing_rows
 from reactorwatch.arrays import Array
 from reactorwatch.diagnosis.run import Run
 from reactorwatch.kalman.batch import GATE, LONGEST_GAP_MIN, LONGEST_ROW_MIN, FilterRecord, InputUncertainty

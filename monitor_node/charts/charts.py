@@ -18,7 +18,7 @@ from monitor_node.alarms.alarms import AlarmChange, ChartAlarm, SuspectedCause
 from monitor_node.alarms.annunciator import Annunciator
 from monitor_node.charts.chart_design import ALL, ChartDesign, alarm_names
 from monitor_node.config import MonitorConfig, PriorityName
-from monitor_node.ingest.rows import MeasuredRow
+from monitor_node.ingest.alignment import MeasuredRow
 from reactorwatch.arrays import Array
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Publication

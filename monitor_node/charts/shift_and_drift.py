@@ -21,7 +21,7 @@ from monitor_node.alarms.alarms import AlarmChange
 from monitor_node.alarms.annunciator import Annunciator
 from monitor_node.charts.charts import chart_point
 from monitor_node.config import MonitorConfig
-from monitor_node.ingest.rows import MeasuredRow
+from monitor_node.ingest.alignment import MeasuredRow
 from monitor_node.learn.arx import JUDGING_FORGETTING, ArxPredictor, arx_structure
 from monitor_node.learn.arx_fit import start_drift_chart
 from reactorwatch.arrays import Array

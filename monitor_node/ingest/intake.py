@@ -7,7 +7,7 @@ from math import isfinite
 import msgspec
 
 from monitor_node.config import MonitorConfig
-from monitor_node.ingest.rows import Aligner, AlignmentMemory, ReplayFilter, Row
+from monitor_node.ingest.alignment import Aligner, AlignmentMemory, ReplayFilter, Row
 from monitor_node.ingest.sequence_check import HeldSample, SequenceCheck
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import OTHER_VERSION, DecodeError, Encoded, Publication, decode

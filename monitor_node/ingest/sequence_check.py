@@ -28,7 +28,7 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import NamedTuple
 
-from monitor_node.ingest.rows import REMEMBERED
+from monitor_node.ingest.alignment import REMEMBERED
 from reactorwatch.runtime.gap_tracker import GapTracker
 from reactorwatch.spc.silence import Spacing
 

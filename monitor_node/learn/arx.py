@@ -29,7 +29,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from monitor_node.config import MonitorConfig
-from monitor_node.ingest.rows import MeasuredRow
+from monitor_node.ingest.alignment import MeasuredRow
 from monitor_node.learn.references import COPY_ROWS, Reference, RowPrediction
 from reactorwatch.arrays import Array
 from reactorwatch.identification.data import Rows

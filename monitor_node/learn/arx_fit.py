@@ -8,7 +8,7 @@ from math import nan
 
 import numpy as np
 
-from monitor_node.ingest.rows import regular_intervals
+from monitor_node.ingest.alignment import regular_intervals
 from monitor_node.learn.arx import ArxMemory, ArxPredictor, ArxReference, simpler_structures
 from monitor_node.learn.training_rows import RowArrays
 from reactorwatch.arrays import Array

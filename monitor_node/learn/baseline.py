@@ -16,7 +16,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from monitor_node.config import MonitorConfig
-from monitor_node.ingest.rows import regular_intervals
+from monitor_node.ingest.alignment import regular_intervals
 from monitor_node.learn import arx_fit
 from monitor_node.learn.arx import ArxReference, arx_structure
 from monitor_node.learn.black_box_reference import BlackBoxReference

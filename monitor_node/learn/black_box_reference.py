@@ -10,7 +10,7 @@ from math import inf, nan
 import msgspec
 import numpy as np
 
-from monitor_node.ingest.rows import TOLERANCE, MeasuredRow, regular_intervals
+from monitor_node.ingest.alignment import TOLERANCE, MeasuredRow, regular_intervals
 from monitor_node.learn.references import COPY_ROWS, FilterReference, Reference, RowFilter, RowPrediction
 from monitor_node.learn.training_rows import RowArrays
 from reactorwatch.arrays import Array

@@ -9,7 +9,7 @@ from math import isfinite, nan
 import msgspec
 import numpy as np
 
-from monitor_node.ingest.rows import NO_INTERVAL, MeasuredRow, missing_in_intervals
+from monitor_node.ingest.alignment import NO_INTERVAL, MeasuredRow, missing_in_intervals
 from monitor_node.learn.references import FilterReference, PlantEquations, Reference, RowFilter, RowPrediction
 from monitor_node.learn.training_rows import RowArrays
 from reactorwatch.arrays import Array

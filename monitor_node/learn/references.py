@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, ClassVar, NamedTuple
 
-from monitor_node.ingest.rows import MeasuredRow
+from monitor_node.ingest.alignment import MeasuredRow
 from monitor_node.learn.training_rows import RowArrays
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.compiled_function import CompiledFunction
@@ -40,7 +40,7 @@ class RowFilter(NamedTuple):
     """A reference's filter of a row as machine code, for the compiled step of ordinary rows.
 
     Attributes:
-        code: machine code of the filter; None: `black_box.filter.filter_row`.
+        code: machine code of the filter; None: `black_box_filter.filter_row`.
         parameters: parameters of the equations; none for a black box, whose constants are those of a plant.
         sizes: sizes of the two arrays of `FilterReference.numbers`.
         spacing_min: shortest and longest time between two rows, in minutes.

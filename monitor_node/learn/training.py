@@ -9,7 +9,7 @@ from itertools import compress
 from operator import not_
 
 from monitor_node.config import MonitorConfig
-from monitor_node.ingest.rows import MeasuredRow
+from monitor_node.ingest.alignment import MeasuredRow
 from monitor_node.learn import arx_fit
 from monitor_node.learn.arx import ArxReference
 from monitor_node.learn.baseline import TrainingResult, fewest_values, learn_baseline

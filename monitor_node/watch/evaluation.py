@@ -18,7 +18,7 @@ from monitor_node.charts.shift_and_drift import DriftWatch, ShiftWatch
 from monitor_node.checks.base import CheckTraining
 from monitor_node.checks.signal_checks import SignalChecks
 from monitor_node.config import MonitorConfig
-from monitor_node.ingest.rows import SamplingPeriod
+from monitor_node.ingest.alignment import SamplingPeriod
 from monitor_node.learn.arx import ArxMemory, ArxPredictor, ArxReference
 from monitor_node.learn.arx_fit import adaptive_snapshot
 from monitor_node.learn.baseline import TrainingResult
@@ -27,7 +27,7 @@ from monitor_node.learn.process_reference import ProcessMemory
 from monitor_node.learn.references import Reference
 from monitor_node.learn.training_rows import TrainingRows
 from monitor_node.watch.power import Watch
-from monitor_node.watch.promise import PlantPromise, PromiseStage
+from monitor_node.watch.promise import PlantPromise, PromiseStage, share_budget
 from monitor_node.watch.row_step import OrdinaryRows
 from monitor_node.watched_process import possible_ranges, stated_ranges
 from reactorwatch.arrays import Array
@@ -309,28 +309,21 @@ class Evaluation:
         return of_steps + self.drift.chance_alarms(self.evaluated)
 
     def _share_budget(self, period_min: float, checks: list[Check]) -> float:
-        """In-control run length of each alarm, in rows.
+        """In-control run length of each alarm, in rows; lasting steps are not tested for where that is in the way.
 
         Raises:
             InputError: the charts cannot keep the rate that the settings ask for.
         """
-        asked, usual = self._config.false_alarms_per_30_days, false_alarm_budget.USUAL_PER_30_DAYS
+        asked = self._config.false_alarms_per_30_days
         try:
-            promised = false_alarm_budget.promise_per_30_days(asked, self.chance_alarms, period_min)
+            return share_budget(asked, self.chance_alarms, period_min, checks)
         except InputError:
             if not self.shift.is_active:
                 raise
-            self.shift.is_active = False
-            why = f"{asked:g} false alarms in 30 days cannot be kept with more alarms"
-            checks.append(Check(name=SHIFT, result=f"lasting steps are not tested for: {why}"))
-            promised = false_alarm_budget.promise_per_30_days(asked, self.chance_alarms, period_min)
-        if asked is None and promised != usual:
-            text = (
-                f"{promised:.3g} false alarms in 30 days are promised instead of {usual:g}: that is the nearest that "
-                f"the charts can keep for {self.chance_alarms} alarms and rows every {period_min:.3g} min"
-            )
-            checks.append(Check(name="promise", result=text))
-        return false_alarm_budget.share_arl0(promised, self.chance_alarms, period_min)
+        self.shift.is_active = False
+        why = f"{asked:g} false alarms in 30 days cannot be kept with more alarms"
+        checks.append(Check(name=SHIFT, result=f"lasting steps are not tested for: {why}"))
+        return share_budget(asked, self.chance_alarms, period_min, checks)
 
     def _alarm_rates(self, trained: TrainingResult, arl0: float) -> Array:
         """False alarms a row by the errors that the training may have made, shape (draws,)."""

@@ -20,7 +20,7 @@ from monitor_node.causes.stage import Suspicion
 from monitor_node.checks.base import CheckRow
 from monitor_node.config import MonitorConfig
 from monitor_node.health import NODE, Failures
-from monitor_node.ingest.rows import MeasuredRow, Row, SamplingPeriod
+from monitor_node.ingest.alignment import MeasuredRow, Row, SamplingPeriod
 from monitor_node.learn.arx import ArxReference
 from monitor_node.learn.baseline import NO_VALUE, TrainingResult
 from monitor_node.learn.training import TrainingMemory

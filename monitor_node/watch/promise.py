@@ -1,9 +1,10 @@
 """Promise of false alarms of one plant: on average, for this plant, and as its training and the watch bear it out.
 
-Limits aim at the configured rate always. On average over trainings they keep it. Of one plant an upper bound at 90 %
-is stated, because its limits were estimated (`reactorwatch.spc.false_alarm_budget`). Both take the plant to go on as in
-its training. Whether it does is checked twice: the second half of the training is judged by the first
-(`promise_check`), and the alarms that come while the plant is watched are compared with those promised.
+Limits aim at the configured rate always: all alarms share it (`share_budget`). On average over trainings they keep it.
+Of one plant an upper bound at 90 % is stated, because its limits were estimated
+(`reactorwatch.spc.false_alarm_budget`). Both take the plant to go on as in its training. Whether it does is checked
+twice: the second half of the training is judged by the first (`promise_check`), and the alarms that come while the
+plant is watched are compared with those promised.
 """
 
 from collections.abc import Callable
@@ -28,7 +29,7 @@ from reactorwatch.arrays import Array
 from reactorwatch.contract import keys
 from reactorwatch.contract.alarm_states import Event
 from reactorwatch.contract.codec import Publication
-from reactorwatch.contract.messages_pb2 import Alarm, Promise
+from reactorwatch.contract.messages_pb2 import Alarm, Check, Promise
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.sentences.promise import describe_broken_promise, describe_promise
 from reactorwatch.spc import false_alarm_budget
@@ -37,6 +38,29 @@ from reactorwatch.stored_state import Memory, Storable
 
 UNLIKELY = 0.003
 """Probability of so many alarms by chance below which the promise is not kept."""
+
+
+def share_budget(asked: float | None, chance_alarms: int, period_min: float, checks: list[Check]) -> float:
+    """In-control run length of each alarm, in rows: the false alarms that are promised, shared by all alarms.
+
+    Args:
+        asked: false alarms in 30 days that the settings ask for; None: the usual number.
+        chance_alarms: number of alarms that can be false alarms.
+        period_min: time between rows.
+        checks: gains a remark where the usual number cannot be promised.
+
+    Raises:
+        InputError: the charts cannot keep the rate that the settings ask for.
+    """
+    usual = false_alarm_budget.USUAL_PER_30_DAYS
+    promised = false_alarm_budget.promise_per_30_days(asked, chance_alarms, period_min)
+    if asked is None and promised != usual:
+        text = (
+            f"{promised:.3g} false alarms in 30 days are promised instead of {usual:g}: that is the nearest that "
+            f"the charts can keep for {chance_alarms} alarms and rows every {period_min:.3g} min"
+        )
+        checks.append(Check(name="promise", result=text))
+    return false_alarm_budget.share_arl0(promised, chance_alarms, period_min)
 
 
 class TrainingCheck(Storable, msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -13,7 +13,7 @@ import msgspec
 
 from monitor_node.alarms.annunciator import Annunciator
 from monitor_node.config import LARGEST_FALSE_ALARMS, MonitorConfig
-from monitor_node.ingest.rows import Row
+from monitor_node.ingest.alignment import Row
 from monitor_node.learn.training_rows import TrainingRows
 from monitor_node.watch.pipeline import PlantPipeline
 from monitor_node.watch.promise import (

@@ -19,7 +19,7 @@ from monitor_node.alarms.alarms import add_point, is_ordinary, raises
 from monitor_node.charts.chart_design import alarm_names
 from monitor_node.checks.signal_checks import CHECKS
 from monitor_node.config import MonitorConfig
-from monitor_node.ingest.rows import WHOLE
+from monitor_node.ingest.alignment import WHOLE
 from monitor_node.learn.references import FilterReference, Reference
 from monitor_node.watch.row_frame import (
     CHARTS,

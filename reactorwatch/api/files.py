@@ -13,7 +13,7 @@ from reactorwatch.contract.codec import Encoded, encode
 from reactorwatch.contract.keys import DEFAULT_PLANT, check_plant
 from reactorwatch.description.read import DEFAULT_CHOICE, ProcessChoice
 from reactorwatch.errors import InputError
-from reactorwatch.records.decode import TABLE_SUFFIXES, is_table, list_files
+from reactorwatch.records.decode import TABLE_SUFFIXES, check_workbook, is_table, list_files
 from reactorwatch.records.file_format import GUESS, FileFormat
 from reactorwatch.records.record import Record
 
@@ -46,6 +46,7 @@ def record(
     if file_kind(path) == "mcap":
         from recorder.tools.convert import read_record
 
+        check_workbook(path, stated.sheet)
         recorded = read_record(path, plant, described)
         return recorded if process is None else convert_to_process(recorded, process)
     return read_process_table(path, described, columns, stated)
@@ -149,6 +150,7 @@ def open_messages(
         return MessageSource(encoded, zero_ns, has_clock_time, measured.read_as, choice.load(), measured)
     from recorder.files.recording import ZERO_NS, Recording, has_clock, zero_from
 
+    check_workbook(path, stated.sheet)
     recording = Recording(path)
     read, metadata = (Encoded(*entry[:4]) for entry in recording.messages(plant=plant)), recording.metadata
     given_ns = zero_from(metadata, 0) if ZERO_NS in metadata else None

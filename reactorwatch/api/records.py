@@ -13,11 +13,11 @@ from reactorwatch.api.files import described_process
 from reactorwatch.api.files import record as read_file
 from reactorwatch.api.shown import Drawn, page_of
 from reactorwatch.description.process import Process
-from reactorwatch.description.read import DEFAULT_PROCESS, convert_to_process, find_process
+from reactorwatch.description.read import convert_to_process, find_process
 from reactorwatch.errors import InputError, describe_unknown
 from reactorwatch.figures import Line, Mark, Panel
 from reactorwatch.optional import make_frame
-from reactorwatch.process import MODELS
+from reactorwatch.process import DEFAULT_PROCESS, MODELS
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.file_format import FileFormat

@@ -31,8 +31,9 @@ from reactorwatch.contract import keys
 from reactorwatch.contract.codec import DecodeError, Encoded, decode
 from reactorwatch.contract.messages_pb2 import Sample
 from reactorwatch.description.process import Process
-from reactorwatch.description.read import DEFAULT_PROCESS, ProcessChoice
+from reactorwatch.description.read import ProcessChoice
 from reactorwatch.errors import prefix_errors
+from reactorwatch.process import DEFAULT_PROCESS
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.decode import quote_formula
 from reactorwatch.records.record import to_minutes, to_time_ns

@@ -31,9 +31,10 @@ from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, decode
 from reactorwatch.contract.messages_pb2 import Alarm, Fault, Incident, Sample
 from reactorwatch.description.process import Process
-from reactorwatch.description.read import DEFAULT_PROCESS, find_process
+from reactorwatch.description.read import find_process
 from reactorwatch.diagnosis.result import NAMED, Diagnosis
 from reactorwatch.errors import InputError
+from reactorwatch.process import DEFAULT_PROCESS
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.fault import FaultSpecification, parse_fault
 from reactorwatch.records.record import MINUTE_NS, to_minutes, to_time_ns

@@ -4,11 +4,12 @@ from collections.abc import Sequence
 
 from reactorwatch.cli.display import json_line
 from reactorwatch.description.process import Process
-from reactorwatch.description.read import DEFAULT_PROCESS, ProcessChoice, find_process
+from reactorwatch.description.read import ProcessChoice, find_process
 from reactorwatch.errors import InputError, describe_unknown
 from reactorwatch.identification.data import Dataset
 from reactorwatch.identification.identify import ModelForm, identify
 from reactorwatch.identification.selection import Selection, select
+from reactorwatch.process import DEFAULT_PROCESS
 from reactorwatch.records.record import Record
 from reactorwatch.sentences.models import identification_text, notes_text
 

@@ -49,13 +49,14 @@ def info(
     """Show the contents of a recording, and missing messages; or how a table is read, and what is in it."""
     from reactorwatch.cli.info import info_object, info_text, table_object, table_text
     from reactorwatch.description.read import read_signals
-    from reactorwatch.records.decode import is_table
+    from reactorwatch.records.decode import check_workbook, is_table
     from reactorwatch.records.read import read_table
     from recorder.tools.inspect import inspect
 
     choice = chosen.choose()
     with task(f"reading {file.name}"):
-        if is_table(check_recording(file)) and not file.is_dir():
+        check_workbook(check_recording(file), table.sheet)
+        if is_table(file) and not file.is_dir():
             record = (
                 read_table(file, None, table.file_format)
                 if choice.is_default

@@ -9,8 +9,9 @@ from plant_node.record import load_process
 from reactorwatch.api.files import record
 from reactorwatch.cli.option_groups import stated_settings
 from reactorwatch.cli.options import check_recording
-from reactorwatch.description.read import DEFAULT_PROCESS, find_in_catalogue, find_process
+from reactorwatch.description.read import find_in_catalogue, find_process
 from reactorwatch.errors import InputError
+from reactorwatch.process import DEFAULT_PROCESS
 from reactorwatch.records.decode import is_table
 from reactorwatch.records.file_format import GUESS, FileFormat
 from reactorwatch.runtime.config import section

@@ -29,10 +29,11 @@ from reactorwatch.cli.processes import (
     write_node_settings,
     write_settings,
 )
-from reactorwatch.description.read import DEFAULT_PROCESS, find_process
+from reactorwatch.description.read import find_process
 from reactorwatch.diagnosis.practical_significance import check_tolerance
 from reactorwatch.errors import InputError
 from reactorwatch.limits import limits
+from reactorwatch.process import DEFAULT_PROCESS
 from reactorwatch.records.write import check_folder_name, make_folder
 from reactorwatch.runtime.config import BusConfig, LogConfig, MetricsConfig, read_settings, section
 from reactorwatch.runtime.event_loop import stop_on_signals

@@ -21,10 +21,10 @@ from reactorwatch.arrays import Array
 from reactorwatch.description.process import Process, Signal, describe_model
 from reactorwatch.description.toml_file import parse_process, parse_tables
 from reactorwatch.errors import InputError, describe_exception, describe_unknown, prefix_errors
-from reactorwatch.process import MODELS
+from reactorwatch.process import DEFAULT_PROCESS, MODELS
 from reactorwatch.process.extended_model import ExtendedModel, parse_extended_model
 from reactorwatch.process.model import ProcessModel
-from reactorwatch.records.decode import read_regular, wrap_read_errors
+from reactorwatch.records.decode import check_workbook, read_regular, wrap_read_errors
 from reactorwatch.records.file_format import GUESS, FileFormat
 from reactorwatch.records.read import MissingColumnError, SignalColumn, read_table
 from reactorwatch.records.record import LARGEST_VALUE, Record
@@ -33,8 +33,6 @@ from reactorwatch.units import conversion
 
 FUNCTION = "process"
 """Function of a `.py` file that returns the process."""
-
-DEFAULT_PROCESS = "cstr"
 
 FILE_KINDS = (".toml", ".py", ".json")
 """Suffixes of files that describe a process."""
@@ -296,6 +294,7 @@ def read_process_table(
     Raises:
         InputError: as `read_table`; or `columns` names no signal of the process.
     """
+    check_workbook(path, stated.sheet)  # that of the process is for its workbooks, and it may have other files too
     names, stated = dict(columns or {}), process.file_format.override(stated)
     for name, unit in STANDARD.items():
         if name in names:

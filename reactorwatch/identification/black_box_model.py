@@ -255,7 +255,7 @@ def prediction_errors(
 
     Args:
         theta: parameters, shape (outputs, terms).
-        products: see `model.Shape.products`.
+        products: see `Shape.products`.
         states: number of states.
         rows: rows of the training.
         gain: share of an error that corrects the state.

@@ -12,6 +12,9 @@ from reactorwatch.process.operation import Operation
 MODELS = (cstr.cstr, cascaded_tanks.tanks, three_tanks.three_tanks)
 """The catalogue of process models: functions that build them."""
 
+DEFAULT_PROCESS = "cstr"
+"""Process where none is named."""
+
 EFFECTS_OF: Mapping[str, tuple[Effect, ...]] = {
     "cstr": cstr.EFFECTS,
     "tanks": cascaded_tanks.EFFECTS,

@@ -10,7 +10,7 @@ import stat
 import zipfile
 import zlib
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import date, datetime, time, timedelta
 from pathlib import Path
 from typing import Any
@@ -152,6 +152,29 @@ def read_text(path: Path, sheet: str | None = None) -> tuple[bytes, list[str]]:
     if not data or data.isspace():
         raise InputError(f"{path}: expected a header and rows, got an empty file")
     return data, notes
+
+
+def check_workbook(path: Path, sheet: str | None) -> None:
+    """Check that a file is a workbook if a sheet of it is asked for.
+
+    Args:
+        path: the file, or a folder of recordings.
+        sheet: what `--sheet` names; None: nothing.
+
+    Raises:
+        InputError: it is none, or cannot be read.
+    """
+    if sheet is None:
+        return
+    head = b""
+    if not path.is_dir():
+        with wrap_read_errors(path), path.open("rb") as file:
+            head = file.read(4)
+        if _kind(head) == "gz":
+            with suppress(OSError, EOFError, zlib.error), gzip.open(path) as packed:
+                head = packed.read(4)
+    if _kind(head) not in ("xlsx", "xls"):
+        raise InputError(f"{path}: --sheet {sheet!r} is of a workbook (.xlsx), and this is none; leave it out")
 
 
 def _kind(data: bytes) -> str:

@@ -13,7 +13,6 @@ with 1, so that a supervisor restarts it.
 
 import errno
 import io
-import logging
 import os
 import platform
 import signal
@@ -24,17 +23,17 @@ import traceback
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from typing import BinaryIO, TextIO, TypeVar, cast
+from typing import TYPE_CHECKING, BinaryIO, TextIO, TypeVar, cast
 
 import msgspec
-import structlog
-from structlog.tracebacks import ExceptionDictTransformer
-from structlog.typing import EventDict, Processor
 
 from reactorwatch.errors import InputError, UnavailableError, describe_exception
 from reactorwatch.runtime.config import BusConfig, LogConfig, MetricsConfig, read_settings, section
 from reactorwatch.terminal import printable
 from reactorwatch.version import this_build
+
+if TYPE_CHECKING:
+    from structlog.typing import EventDict, Processor
 
 Config = TypeVar("Config", bound=msgspec.Struct)
 
@@ -86,7 +85,7 @@ _MULTILINE = frozenset({"exception", "stack"})
 """Fields with tracebacks."""
 
 
-def _escape(_logger: object, _method: str, event: EventDict) -> EventDict:
+def _escape(_logger: object, _method: str, event: "EventDict") -> "EventDict":
     """Make texts of a line safe for a terminal; the JSON renderer escapes by itself."""
     return {
         printable(name): printable(value) if isinstance(value, str) and name not in _MULTILINE else value
@@ -130,13 +129,16 @@ def _without_buffer(stream: TextIO) -> TextIO:
     return io.TextIOWrapper(raw, encoding=stream.encoding, errors=stream.errors, write_through=True)
 
 
-def configure_log(level: int = logging.INFO, *, as_json: bool = False) -> None:
+def configure_log(level: int = 20, *, as_json: bool = False) -> None:
     """Send the log to standard error.
 
     Args:
-        level: the least severe level that is logged.
+        level: the least severe level that is logged, as in `logging`; 20: information.
         as_json: write a JSON object a line; else coloured for people on a terminal, plain `key=value` elsewhere.
     """
+    import structlog  # only here: with asyncio and rich it is half of the start of `--help`
+    from structlog.tracebacks import ExceptionDictTransformer
+
     form: list[Processor] = [
         structlog.processors.TimeStamper(fmt="%H:%M:%S", utc=False),
         _escape,

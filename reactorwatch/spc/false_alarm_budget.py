@@ -60,9 +60,9 @@ USUAL_PER_30_DAYS = 1.0
 SHORTEST_ARL0 = 10 * SHORTEST_DESIGN
 """Shortest run length of an alarm, in rows: more frequent alarms are no promise."""
 
-CONFIDENCE, QUANTILE = 0.9, 0.93
-"""Confidence of the bound of a plant's rate, and the quantile that is taken: rates by tails are good to some percent
-(`make promise` holds the bound to simulation)."""
+QUANTILE = 0.93
+"""Quantile of a plant's rate that is taken as its bound at 90 %: rates by tails are good to some percent (`make
+promise` holds the bound to simulation)."""
 
 DRAWS, SEED = 400, 20_260_523
 """Draws of the errors of a training, of which the quantile is the 28th largest; always the same ones."""

@@ -14,7 +14,7 @@ from reactorwatch.contract.messages_pb2 import Sample
 from reactorwatch.description.process import Process
 from reactorwatch.description.read import DEFAULT_CHOICE, ProcessChoice, convert_to_process, read_signals
 from reactorwatch.errors import InputError
-from reactorwatch.records.decode import is_table
+from reactorwatch.records.decode import check_workbook, is_table
 from reactorwatch.records.file_format import GUESS, FileFormat
 from reactorwatch.records.record import LONGEST_MIN, MINUTE_NS, Record, join_files, join_runs, to_time_ns
 from reactorwatch.records.write import atomic_write, refuse_source, write_table
@@ -117,6 +117,7 @@ def export_csv(
             written, see `write_table`.
     """
     refuse_source(csv, (mcap,))
+    check_workbook(mcap, stated.sheet)
     if is_table(mcap) and not mcap.is_dir():
         record = read_signals(mcap, choice, None, stated)
     elif choice.is_default:

@@ -21,7 +21,7 @@ from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Publication
 from reactorwatch.description.read import ProcessChoice, read_signals
 from reactorwatch.errors import InputError
-from reactorwatch.records.decode import is_table
+from reactorwatch.records.decode import check_workbook, is_table
 from reactorwatch.records.record import NEVER_NS, to_time_ns
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.event_loop import EventLoop, StopSignal, stop_on_signals
@@ -169,6 +169,7 @@ def open_tape(config: ReplayConfig) -> tuple[tuple[str, ...], Callable[[], Itera
         InputError: as `run_replay`.
     """
     path, choice = Path(config.file), ProcessChoice(config.process, config.inputs, config.outputs)
+    check_workbook(path, config.table.sheet)
     if is_table(path):
         plant = plant_name(config.plant, choice.load())
         record = read_signals(path, choice, config.columns, config.table)

@@ -100,7 +100,7 @@ def test_names_in_docstrings_comments_and_docs_exist() -> None:
         ("what is done is in `output_watch.py`", ["output_watch.py"]),
         ("see watch/pipeline.py", []),
         ("see charts/rows.py", ["charts/rows.py"]),
-        ("[x](../monitor_node/ingest/rows.py)", []),
+        ("[x](../monitor_node/ingest/alignment.py)", []),
     ],
 )
 def test_a_file_that_does_not_exist_is_found(text: str, missing: list[str]) -> None:

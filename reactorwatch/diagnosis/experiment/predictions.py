@@ -30,7 +30,7 @@ from reactorwatch.diagnosis.experiment.inputs import InputRange, Limits, keeps_l
 from reactorwatch.diagnosis.fitting.colored_noise import Noise
 from reactorwatch.diagnosis.fitting.hypothesis import Fit, Hypothesis
 from reactorwatch.diagnosis.fitting.profiles import Constant, FittedProfile, LateSine, Sine
-from reactorwatch.diagnosis.fitting.refinement import fit_hypothesis
+from reactorwatch.diagnosis.fitting.scan import fit_hypothesis
 from reactorwatch.diagnosis.result import LISTED
 from reactorwatch.diagnosis.run import Run
 from reactorwatch.diagnosis.search.search import FittedHypothesis

@@ -14,7 +14,7 @@ from reactorwatch.diagnosis.report import mathml, panels
 from reactorwatch.diagnosis.report.equations import Equation, balances, meanings
 from reactorwatch.diagnosis.result import AMBIGUOUS, NOMINAL, Cause, Diagnosis, Experiment
 from reactorwatch.diagnosis.whiteness import WHITE
-from reactorwatch.process import MODELS
+from reactorwatch.process import DEFAULT_PROCESS
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.profiles import FREE_NAME, PROFILES
@@ -169,7 +169,7 @@ def _evidence(diagnosis: Diagnosis, effects: Sequence[Effect]) -> list[tuple[str
 def _experiment_command(experiment: Experiment | None, experiment_file: str, process: str) -> str:
     if experiment is None:
         return ""
-    named = "" if process == MODELS[0]().name else f" --process {quote(process)}"
+    named = "" if process == DEFAULT_PROCESS else f" --process {quote(process)}"
     return f"reactorwatch plant{named} --scenario {quote(experiment_file)} --duration {experiment.span_min:g}"
 
 

@@ -19,7 +19,7 @@ from msgspec.structs import replace
 from reactorwatch.arrays import Array
 from reactorwatch.diagnosis.fitting.hypothesis import Hypothesis
 from reactorwatch.diagnosis.fitting.profiles import Constant, Step
-from reactorwatch.diagnosis.fitting.refinement import search_coarse, search_fine
+from reactorwatch.diagnosis.fitting.scan import search_coarse, search_fine
 from reactorwatch.diagnosis.search.search import (
     CONVERGED_NOISE,
     FAR_OUT,

@@ -21,8 +21,8 @@ from reactorwatch.diagnosis.fitting.fault_filter import FaultFilter, FilterEvalu
 from reactorwatch.diagnosis.fitting.hypothesis import MOST_STEPS, Fit, Hypothesis, prior_cost
 from reactorwatch.diagnosis.fitting.outliers import find_gross_outliers, find_outliers, remove_outliers
 from reactorwatch.diagnosis.fitting.profiles import LateSine, PiecewiseLinear, Signal, Sine
-from reactorwatch.diagnosis.fitting.refinement import GRID, refine_onset, select_knots
-from reactorwatch.diagnosis.fitting.refinement import fit_hypothesis as scan_and_fit
+from reactorwatch.diagnosis.fitting.scan import GRID, refine_onset, select_knots
+from reactorwatch.diagnosis.fitting.scan import fit_hypothesis as scan_and_fit
 from reactorwatch.diagnosis.run import Run
 from reactorwatch.diagnosis.search.dynamic_and_pair_screens import DynamicEffectsScreen
 from reactorwatch.diagnosis.search.screen import Candidate, Part, Screen, first_of_each

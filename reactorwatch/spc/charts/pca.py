@@ -68,19 +68,20 @@ class Components(NamedTuple):
         """Components among the arrays of a model, by name."""
         return cls(*(model[name] for name in cls._fields))
 
-    def parts(self, x: Array) -> Array:
-        """Each signal's part of T2 and of SPE of a row of shape (signals,), shape (2, signals).
+    def t2_parts(self, x: Array) -> Array:
+        """Each signal's part of T2 of a row, both of shape (signals,): x_j (R l^-1 t)_j; one may be negative."""
+        used = self.variances > 0.0
+        weighted = np.where(used, x @ self.rotations / np.where(used, self.variances, 1.0), 0.0)
+        return np.asarray(x * (self.rotations @ weighted))
 
-        x_j (R l^-1 t)_j, of which one may be negative, and the squared residuals.
-        """
-        scores, used = x @ self.rotations, self.variances > 0.0
-        weighted = np.where(used, scores / np.where(used, self.variances, 1.0), 0.0)
-        return np.array([x * (self.rotations @ weighted), (x - self.loadings @ scores) ** 2])
+    def spe_parts(self, x: Array) -> Array:
+        """Each signal's part of SPE of a row, both of shape (signals,): its squared residual."""
+        return np.asarray((x - self.loadings @ (x @ self.rotations)) ** 2)
 
     def relative_parts(self, x: Array) -> Array:
-        """The same, of T2 and SPE divided by their means."""
+        """Each signal's part of T2 and of SPE, divided by their means, shape (2, signals)."""
         used = max(int(np.count_nonzero(self.variances > 0.0)), 1)
-        return np.asarray(self.parts(x) / [[used], self.rest])
+        return np.array([self.t2_parts(x) / used, self.spe_parts(x) / self.rest])
 
 
 def standardise(values: Array) -> tuple[Array, Array, Array]:
@@ -156,7 +157,7 @@ class _PcaChart(JointChart):
 
     memory_type = PcaModel
     has_memory = False
-    statistic: ClassVar[int]  # its index in the parts
+    statistic: ClassVar[int]  # 0: T2, 1: SPE
 
     def __init__(self, model: PcaModel) -> None:
         self._use(model)
@@ -170,7 +171,8 @@ class _PcaChart(JointChart):
             raise ValueError(f"scales must be positive, got {memory.scale.tolist()}")
         a = loadings.shape[1]
         self.memory = memory
-        self._components = Components(loadings, loadings, variances[:a], np.array([variances[a:].sum()]))
+        components = Components(loadings, loadings, variances[:a], np.array([variances[a:].sum()]))
+        self._parts = (components.t2_parts, components.spe_parts)[self.statistic]
         self._centre = (float(a), float(variances[a:].sum()))[self.statistic]
         self._limit = (memory.t2_limit, memory.spe_limit)[self.statistic]
 
@@ -197,10 +199,9 @@ class _PcaChart(JointChart):
         return Judgement(statistic, self._centre, 0.0, self._limit, statistic > self._limit)
 
     def contributions(self, x: ArrayLike) -> Array:
-        """See `JointChart`; their sum is the statistic, see `Components.parts`."""
+        """See `JointChart`; their sum is the statistic."""
         memory = self.memory
-        parts = self._components.parts((vector(x, memory.mean.size) - memory.mean) / memory.scale)
-        return np.asarray(parts[self.statistic])
+        return self._parts((vector(x, memory.mean.size) - memory.mean) / memory.scale)
 
     def restart(self) -> None:
         """Do nothing: there is no memory."""

@@ -35,8 +35,9 @@ def test_linear_algebra_has_one_thread_unless_more_are_set(
     assert os.environ[THREADS] == then
 
 
-def test_it_is_settled_before_numpy_is_imported() -> None:
-    question = "import sys, reactorwatch.cli.main; sys.exit('numpy' in sys.modules)"
+@pytest.mark.parametrize("slow", ["numpy", "structlog", "asyncio", "rich"])
+def test_help_imports_nothing_that_is_slow_and_threads_are_settled_before_numpy(slow: str) -> None:
+    question = f"import sys, reactorwatch.cli.main; sys.exit({slow!r} in sys.modules)"
     assert subprocess.run([sys.executable, "-c", question], check=False).returncode == 0
 
 

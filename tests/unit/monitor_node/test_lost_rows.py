@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from monitor_node.causes.isolation import UNKNOWN, Isolation
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
-from monitor_node.ingest.rows import Interval, MeasuredRow
+from monitor_node.ingest.alignment import Interval, MeasuredRow
 from monitor_node.learn.process_reference import ProcessMemory, ProcessReference, input_reach
 from reactorwatch.contract.codec import Encoded
 from reactorwatch.contract.messages_pb2 import Alarm, Sample

@@ -7,7 +7,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from monitor_node.config import MonitorConfig
-from monitor_node.ingest.rows import Aligner
+from monitor_node.ingest.alignment import Aligner
 from monitor_node.replay.backtest import run
 from reactorwatch.contract.codec import encode
 from reactorwatch.records.record import MINUTE_NS, Record

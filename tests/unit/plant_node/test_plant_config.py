@@ -14,8 +14,9 @@ from typer.main import get_command
 from plant_node.config import PlantConfig, ProcessSettings, fit_settings
 from plant_node.record import simulate_record
 from reactorwatch.cli.main import app
-from reactorwatch.description.read import DEFAULT_PROCESS, find_process
+from reactorwatch.description.read import find_process
 from reactorwatch.errors import InputError
+from reactorwatch.process import DEFAULT_PROCESS
 from reactorwatch.process.fault import parse_fault
 from reactorwatch.process.library.cstr import EFFECTS, cstr
 from reactorwatch.process.library.cstr_operation import ONSET_MIN, OPERATION, LevelControl, TemperatureControl

@@ -105,6 +105,10 @@ CAUSES = ", ".join(effect.name for effect in EFFECTS)
             "coolant_flow:free:0.1,0min=1",
             "a curve must have 2 to 100 times with their shares, like ,0min=0,90min=1, got 1",
         ),
+        (
+            "coolant_flow:free:0.1," + ",".join(f"{minute}min=1" for minute in range(101)),
+            "a curve must have 2 to 100 times with their shares, like ,0min=0,90min=1, got 101",
+        ),
         ("coolant_flow:free:0.1,0=1,9min=1", "time must be a time with its unit (s, min, h), like 30min, got '0'"),
         ("coolant_flow:free:0.1,0min,9min=1", "share must be a number, got ''"),
         ("coolant_flow:free:0.1,9min=1,9min=0", "times must rise, got 9 min after 9 min"),

@@ -105,6 +105,24 @@ def test_a_sheet_that_is_not_there_is_refused_with_those_that_are(sheet: str, tm
         read_table(path, None, FileFormat(sheet="empty"))
 
 
+@pytest.mark.parametrize("name", ["rig.csv", "rig.csv.gz", "rig.parquet", "rig.mcap"])
+@pytest.mark.parametrize("command", ["info", "backtest", "export"])
+def test_a_sheet_of_a_file_that_is_no_workbook_is_refused(command: str, name: str, tmp_path: Path) -> None:
+    path, table = tmp_path / name, tmp_path / ("table.csv" if name.endswith("mcap") else name)
+    write_table(table, read_table(write(tmp_path / "book.xlsx", {"Data": SHEETS["Data"]})))
+    if path != table:
+        assert not CliRunner().invoke(app, ["import", str(table), "-o", str(path), "--output", "T"]).exit_code
+    more = ["-o", str(tmp_path / "out.csv")] if command == "export" else []
+    error = CliRunner().invoke(app, [command, str(path), "--sheet", "2", *more]).exception
+    assert isinstance(error, InputError)
+    assert str(error) == f"{path}: --sheet '2' is of a workbook (.xlsx), and this is none; leave it out"
+
+
+def test_the_sheet_of_a_process_is_for_its_workbooks_alone(tmp_path: Path) -> None:
+    write_table(tmp_path / "rig.csv", read_table(write(tmp_path / "book.xlsx", {"Data": SHEETS["Data"]})))
+    assert rw.read_record(tmp_path / "rig.csv", process=_process(tmp_path, "sheet = 2")).columns["T"][-1] == 39.0
+
+
 def test_each_kind_of_cell_is_written_as_in_a_text(tmp_path: Path) -> None:
     cells: list[tuple[object, str]] = [
         (5, "5"),

@@ -1,5 +1,6 @@
 """Properties of every chart of the catalogue."""
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 
 from reactorwatch.errors import InputError
 from reactorwatch.spc.charts.catalogue import CHARTS
+from reactorwatch.spc.charts.cusum import Cusum
 from reactorwatch.spc.charts.ewma import Ewma
 from reactorwatch.spc.charts.shewhart import Shewhart
 from reactorwatch.spc.compiled_chart import Bank, CompiledChart
@@ -124,9 +126,22 @@ def test_a_memory_of_another_chart_is_refused() -> None:
 
 @pytest.mark.parametrize("kind", COMPILED_CHARTS, ids=lambda chart: chart.name)
 def test_a_standard_deviation_of_zero_is_refused(kind: Any) -> None:
-    """Other settings out of range are those that have no run length, see `test_run_length.py`."""
     with pytest.raises(InputError, match=r"sigma must be a positive number, got 0\.0"):
         kind(0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("new", "message"),
+    [
+        (lambda: Shewhart(0.0, 1.0, rules=(1, 5)), r"rules must be some of 1, 2, 3, 4, got \(1, 5\)"),
+        (lambda: Shewhart(0.0, 1.0, width=-3.0), r"width must be a positive number, got -3\.0"),
+        (lambda: Ewma(0.0, 1.0, weight=1.5), r"weight \(lambda\) must be in \(0, 1\], got 1\.5"),
+        (lambda: Cusum(0.0, 1.0, h=-5.0), r"h must be a positive number, got -5\.0"),
+    ],
+)
+def test_a_chart_checks_its_settings_as_its_run_length_does(new: Callable[[], object], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        new()
 
 
 def test_rules_count_only_points_that_complete_a_pattern() -> None:

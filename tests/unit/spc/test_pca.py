@@ -1,5 +1,6 @@
 """PCA charts: their limits, and what they blame."""
 
+import msgspec
 import numpy as np
 import pytest
 from scipy import stats
@@ -95,3 +96,16 @@ def test_a_covariance_that_is_none_is_refused() -> None:
 def test_a_training_that_makes_no_model_is_refused(training: Array, components: int, message: str) -> None:
     with pytest.raises(InputError, match=message):
         PcaModel.fit(training, components)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"variances": np.ones(2)}, "must hold loadings, scales and variances of its 6 signals"),
+        ({"scale": np.zeros(6)}, "scales must be positive"),
+    ],
+)
+def test_a_memory_whose_parts_do_not_fit_together_is_refused(change: dict[str, Array], message: str) -> None:
+    model = PcaModel.fit(related(np.random.default_rng(1), 100), 2, 0.01)
+    with pytest.raises(ValueError, match=message):
+        PcaT2(msgspec.structs.replace(model, **change))

@@ -281,6 +281,7 @@ def test_far_shifts_are_seen_at_once() -> None:
         (lambda: mewma_run_length(1.0, 2, 1e-3, 8.0), r"weight \(lambda\) must be in \[0.01, 1\], got 0.001"),
         (lambda: mewma_run_length(0.0, 2, 1e-5, 8.0), r"weight \(lambda\) must be in \[0.0001, 1\], got 1e-05"),
         (lambda: shewhart_run_length(0.0, 30.0), r"the run length must be below 1e\+12 samples"),
+        (lambda: t2_run_length(0.0, 0, 10.0), r"dimension must be in \[1, 100\], got 0"),
         (lambda: t2_run_length(0.0, 2, -1.0), "limit must be a positive number, got -1.0"),
     ],
 )

@@ -7,7 +7,7 @@ from copy import deepcopy
 
 import pytest
 
-from monitor_node.ingest.rows import Aligner, AlignmentMemory, ReplayFilter
+from monitor_node.ingest.alignment import Aligner, AlignmentMemory, ReplayFilter
 
 PERIOD = 100
 SIGNALS = ("C", "T")

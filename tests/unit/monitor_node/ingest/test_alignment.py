@@ -9,7 +9,14 @@ import random
 import numpy as np
 import pytest
 
-from monitor_node.ingest.rows import LEARN_FROM, Aligner, Row, SamplingPeriod, missing_in_intervals, regular_intervals
+from monitor_node.ingest.alignment import (
+    LEARN_FROM,
+    Aligner,
+    Row,
+    SamplingPeriod,
+    missing_in_intervals,
+    regular_intervals,
+)
 
 SIGNALS = ("qc", "C", "T")
 PERIOD = 100

@@ -9,7 +9,7 @@ from reactorwatch.diagnosis.fitting.colored_noise import Noise
 from reactorwatch.diagnosis.fitting.fault_filter import FaultFilter
 from reactorwatch.diagnosis.fitting.hypothesis import MOST_STEPS, Hypothesis
 from reactorwatch.diagnosis.fitting.profiles import Constant, Decay, FittedProfile, PiecewiseLinear, Ramp, Step
-from reactorwatch.diagnosis.fitting.refinement import (
+from reactorwatch.diagnosis.fitting.scan import (
     GRID,
     fit_hypothesis,
     refine_onset,
