@@ -67,7 +67,7 @@ class Shown(Drawn, Generic[R]):
         return getattr(self.result, name)
 
     def __dir__(self) -> list[str]:
-        return sorted({*super().__dir__(), *self.result.__struct_fields__})
+        return sorted({*super().__dir__(), *(name for name in vars(type(self.result)) if not name.startswith("_"))})
 
     def to_dict(self) -> dict[str, Any]:
         """The object that the command prints with `--json`; numbers that are not finite are None."""

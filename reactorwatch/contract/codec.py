@@ -5,6 +5,7 @@ version. A payload is decoded by that name only, so foreign bytes on a key are r
 many of them as an empty message.
 """
 
+import copyreg
 from collections.abc import Callable, Mapping
 from typing import NamedTuple, TypeAlias, get_args
 
@@ -127,6 +128,14 @@ def decode(payload: bytes, encoding: str) -> Message:
     except ProtobufDecodeError as error:
         name = encoding.removeprefix(PREFIX)
         raise DecodeError("payload", f"{len(payload)} bytes are not a {name}: {error}") from error
+
+
+def _reduce(message: Message) -> tuple[Callable[[bytes, str], Message], tuple[bytes, str]]:
+    return decode, encode_message(message)
+
+
+for _kind in MESSAGES:  # pickle would import the generated module by a name that it does not have here
+    copyreg.pickle(_kind, _reduce)
 
 
 MAX_NAME = 64  # as long as the name of a plant

@@ -4,6 +4,7 @@ import copy
 import csv
 import io
 import json
+import pickle
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Iterator
 from datetime import UTC, datetime, timedelta
@@ -63,6 +64,20 @@ def test_a_result_has_the_fields_of_its_json_as_attributes_and_survives_a_copy(
     for key, value in stated.items():
         assert value is None or getattr(result, key) is not None
     assert copy.copy(result).to_dict() == result.to_dict()
+    if name != "diagnosis":  # CasADi's expressions can be pickled in a context of its own only
+        assert pickle.loads(pickle.dumps(result)).to_dict() == result.to_dict()
+
+
+def test_parts_of_a_result_can_be_read_as_the_dicts_of_its_json(results: dict[str, Any]) -> None:
+    result = results["backtest"]
+    stated = result.to_dict()
+    assert dict(result.promise) == dict(result.promise.items()) == stated["promise"]
+    assert result.promise["kept"] is result.promise.get("kept") is result.promise.kept
+    assert "kept" in result.promise
+    assert "message" not in result.alarms[0]
+    assert result.promise.get("message", "none") == "none"
+    pandas = pytest.importorskip("pandas")
+    assert pandas.DataFrame(result.power)["deviation"].tolist() == [item["deviation"] for item in stated["power"]]
 
 
 @pytest.mark.parametrize("name", RESULTS)
