@@ -59,7 +59,6 @@ ONSET_MIN = 150.0
 START_WITHIN_S = 60.0
 SETTINGS_FILE = "settings.toml"
 DIAGNOSIS_FOLDER = "diagnosis"
-DRAIN_TIMEOUT_S = 1.0  # for the recorder, which is stopped last
 
 
 def choose_fault(text: str | None, process: Process) -> FaultSpecification:
@@ -87,7 +86,7 @@ def run(flags: dict[str, Any], fault: str | None, out: Path | None, site: Path |
     recorder = RecorderConfig(
         plant=PLANT,
         out=str(recording),
-        linger_s=DRAIN_TIMEOUT_S,
+        linger_s=1.0,  # it is stopped last
         black_box_min=0.0,
         processes={PLANT: flags["process"] or DEFAULT_PROCESS},
         about={"seed": str(plant.seed)},

@@ -11,9 +11,6 @@ from reactorwatch.errors import InputError
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.steady_state import SteadyState, compare_step, linearise, steady_states
 
-STEP_SHARE = 0.1
-"""Default step of an input, as a share of its scale."""
-
 
 def describe(model: ProcessModel, levels: Sequence[float], step: float | None, *, as_json: bool) -> str:
     """Format all steady states at constant inputs with their linear models."""
@@ -23,7 +20,7 @@ def describe(model: ProcessModel, levels: Sequence[float], step: float | None, *
         )
     if step == 0:
         raise InputError("--step must not be 0")
-    steps = {item.name: STEP_SHARE * item.scale if step is None else step for item in model.inputs}
+    steps = {item.name: 0.1 * item.scale if step is None else step for item in model.inputs}
     for item, level in zip(model.inputs, levels, strict=True):
         for name, value in ((item.name, level), (f"{item.name} + step", level + steps[item.name])):
             if not item.lower <= value <= item.upper:

@@ -213,7 +213,8 @@ class PlantOptions(BusOptions):
     """Settings file, router and plant of a command on the bus."""
 
     name: Annotated[
-        str | None, fold(BUS, "--plant", help="Name of the plant [that of the settings, or cstr; of status: all].")
+        str | None,
+        fold(BUS, "--plant", help="Name of the plant [of the settings or the file, else cstr; status: all]."),
     ] = None
 
 
