@@ -23,8 +23,8 @@ MOSTLY_NOISE, WORSE = 0.9, 1.2
 """Noise share above which no range is named; error of a range, relative to all rows, above which it is named."""
 
 
-def describe_verdict(diagnosis: "Diagnosis") -> str:
-    """Verdict in a sentence or two."""
+def describe_verdict(diagnosis: "Diagnosis", *, are_listed: bool = False) -> str:
+    """Verdict in a sentence or two; it counts rival explanations that are listed elsewhere, and names others."""
     off = [name for name, item in diagnosis.parameters.items() if item.differs]
     if diagnosis.verdict == "nominal" and off:
         return (
@@ -36,6 +36,11 @@ def describe_verdict(diagnosis: "Diagnosis") -> str:
     matters = describe_significance(diagnosis)
     if diagnosis.verdict == "ambiguous":
         explanations = [diagnosis.causes, *(item.explanation for item in diagnosis.alternatives)]
+        if are_listed:
+            return (
+                f"The simulation is wrong, and the record cannot tell which of {len(explanations)} explanations is "
+                f"right. {matters}"
+            )
         names = [" with ".join(f"{item.label} ({describe_timing(item)})" for item in causes) for causes in explanations]
         return f"The simulation is wrong, and the record cannot tell why: {' or '.join(names)}. {matters}"
     if diagnosis.verdict == "named":

@@ -5,7 +5,7 @@ Huber (1964, Robust estimation of a location parameter, Annals of Mathematical S
 `HUBER` standard deviations. With process noise the filter follows the measurements, without any it is a simulation; so
 a plant that starts on another branch, or is extinguished, does not mislead the fit. The loss is minimised by
 Gauss-Newton steps with Levenberg-Marquardt damping. Derivatives come from the filter's error equations (`signatures`).
-Magnitudes of discontinuous effects have no derivatives and are scanned (`scan`).
+Magnitudes of discontinuous effects, such as stiction, have no derivatives and are scanned (`scan`).
 
 Prior probabilities of hypotheses, as costs in BIC (docs/decisions/0014-two-causes.md). Of n possible causes each is
 there from the beginning with the probability 1/n, so that one is expected, and a cause that nothing in the catalogue

@@ -1,4 +1,4 @@
-"""Refine a fitted hypothesis where the loss has no gradient: onsets, knots, discontinuous effects.
+"""Scans where the loss has no gradient: onsets, numbers of knots, discontinuous effects such as stiction.
 
 Refine the onset of an input-timing fault; only rows where the input changes are informative. Between two input changes
 all onsets are equivalent, and the loss has no slope towards the next interval. So once the other parameters are fitted,

@@ -24,7 +24,6 @@ from reactorwatch.sentences.diagnosis import (
     describe_location,
     describe_parameter,
     describe_place,
-    describe_significance,
     describe_size,
     describe_timing,
     describe_verdict,
@@ -78,12 +77,7 @@ def as_page(
     return _PAGES.get_template("page.html.j2").render(
         diagnosis=diagnosis,
         file=file,
-        verdict=(
-            f"The simulation is wrong, and the record cannot tell which of {len(rivals)} explanations is right. "
-            f"{describe_significance(diagnosis)}"
-            if rivals
-            else describe_verdict(diagnosis)
-        ),
+        verdict=describe_verdict(diagnosis, are_listed=True),
         place=describe_location(diagnosis) if diagnosis.verdict != NOMINAL else "",
         alternatives=rivals,
         where=describe_place,

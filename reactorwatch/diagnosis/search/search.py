@@ -370,7 +370,7 @@ class Search:
     def fit(
         self, hypothesis: Hypothesis, start: Sequence[Array], steps: int = MOST_STEPS, scan: bool = True
     ) -> FittedHypothesis:
-        """Fit a hypothesis, by `refinement.fit_hypothesis` where its effects are discontinuous and `scan` is set."""
+        """Fit a hypothesis, by `fitting.scan` where its effects are discontinuous and `scan` is set."""
         best = scan_and_fit(self.run, hypothesis, start, steps) if scan else hypothesis.fit(self.run, start, steps)
         return self.score_fit(hypothesis, refine_onset(self.run, hypothesis, best, steps))
 
