@@ -122,9 +122,9 @@ class CommandRateLimiter:
                 self._names.popitem(last=False)
         if not refused:
             return None
-        rate, who = (PER_NAME, f" by {name!r}") if name and left < 1.0 else (ALL, "")
+        rate, sender = (PER_NAME, f" by {name!r}") if name and left < 1.0 else (ALL, "")
         return (
-            f"too many commands{who}: {rate.at_once:g} at once and {rate.per_s:g} a second are taken; "
+            f"too many commands{sender}: {rate.at_once:g} at once and {rate.per_s:g} a second are taken; "
             f"try again in a second"
         )
 

@@ -108,9 +108,9 @@ class LogFile(io.TextIOBase):
 
     def write(self, line: str) -> int:
         """Write a line, or count it; returns the number of its characters."""
-        said = f"lines of the log that could not be written: {self.lost}\n" if self.lost else ""
+        lost = f"lines of the log that could not be written: {self.lost}\n" if self.lost else ""
         try:
-            self._stream.write(said + line)
+            self._stream.write(lost + line)
             self._stream.flush()
         except OSError:
             self.lost += 1

@@ -81,7 +81,7 @@ def claim_name(bus: Bus, node: str, token: str, stop: StopSignal) -> bool:
     Raises:
         UnavailableError: another instance is alive for longer than one that died would seem to be.
     """
-    instances, until, said = f"{token.rpartition('/')[0]}/*", time.monotonic() + GONE_WITHIN_S, False
+    instances, until, is_logged = f"{token.rpartition('/')[0]}/*", time.monotonic() + GONE_WITHIN_S, False
     while not stop.is_set:
         if not (others := bus.query_tokens(instances)):
             bus.declare_token(token)
@@ -100,9 +100,9 @@ def claim_name(bus: Bus, node: str, token: str, stop: StopSignal) -> bool:
                 f"another {node} of {of} is alive, as process {process} on {host}: stop one of them, or give this "
                 f"one {option}"
             )
-        if not said:
+        if not is_logged:
             log.warning("another is alive: waiting for its end", node=node, plant=plant, host=host, process=process)
-            said = True
+            is_logged = True
         stop.wait(random.uniform(*LOOK_AGAIN_S))  # noqa: S311 (no secret)
     return False
 

@@ -251,8 +251,8 @@ class RefusalLog:
         if verdict is not None and self._is_of_message(verdict) and verdict["is_refused"]:
             name = self._names.get(verdict["session"], verdict["session"])
             parts = (verdict["what"], name, verdict["key"])
-            what, who, key = (ascii(part.decode(errors="replace"))[1:-1][:200] for part in parts)
-            self._text = f"refused: {what} by {who} on {key}"
+            what, holder, key = (ascii(part.decode(errors="replace"))[1:-1][:200] for part in parts)
+            self._text = f"refused: {what} by {holder} on {key}"
             self._since, self._total = self._since + 1, self._total + 1
         return _DECISION.search(line) is not None or verdict is not None
 

@@ -142,9 +142,9 @@ def test_an_effect_with_other_constants_is_named_with_them(fault: str, truth: di
     (cause,) = found.causes
     assert (found.verdict, cause.cause) == (NAMED, fault.partition(":")[0])
     for name, value in truth.items():
-        said = cause.parameters[name]
-        assert abs(said.value - value) < 4 * said.sd, name
-        assert said.sd < 0.25 * abs(value), name
+        stated = cause.parameters[name]
+        assert abs(stated.value - value) < 4 * stated.sd, name
+        assert stated.sd < 0.25 * abs(value), name
 
 
 def test_every_constant_is_within_its_bounds_and_has_a_prior() -> None:

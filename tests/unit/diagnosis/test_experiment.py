@@ -156,7 +156,7 @@ def test_nothing_in_it_refers_to_the_reactor() -> None:
 
 
 @pytest.mark.parametrize(
-    ("limits", "said"),
+    ("limits", "stated"),
     [
         ({"p": (1.0, 2.0)}, "limits must be of qc, C, T, got p"),
         ({"T": (455.0, 425.0)}, r"limits of T must be two rising numbers, got 455\.\.425"),
@@ -164,8 +164,8 @@ def test_nothing_in_it_refers_to_the_reactor() -> None:
         ({"qc": (-5.0, 110.0)}, r"limits of qc must be within 0\.\.500 l/min, got -5\.\.110"),
     ],
 )
-def test_limits_that_cannot_be_meant_are_refused_in_a_line(limits: dict[str, tuple[float, float]], said: str) -> None:
-    with pytest.raises(InputError, match=said):
+def test_limits_that_cannot_be_meant_are_refused_in_a_line(limits: dict[str, tuple[float, float]], stated: str) -> None:
+    with pytest.raises(InputError, match=stated):
         check_limits(cstr(), limits)
 
 
@@ -196,7 +196,7 @@ def test_levels_are_short_numbers_within_the_ends() -> None:
 
 ROWS = 300
 SIZES = (0.02, 0.1)
-"""Of the gain and of the shift: at a level of 5 they are the same."""
+"""Sizes of the gain and of the shift, which are the same deviation at a level of 5."""
 
 
 def steps(reach: float, rows: int = ROWS, seed: int = 3) -> Array:
@@ -314,8 +314,8 @@ def test_the_experiment_decides(cause: str, size: float, alternative: str, seed:
     decided = diagnose(measured, cstr())
     assert decided.verdict == NAMED
     assert [item.cause for item in decided.causes] == [cause]
-    said = decided.causes[0].parameters["size"]
-    assert abs(said.value - size) < 4.0 * said.sd
+    stated = decided.causes[0].parameters["size"]
+    assert abs(stated.value - size) < 4.0 * stated.sd
     assert decided.alternatives == ()
     assert decided.experiment is None
     assert np.mean((measured.columns["T"] < 425.0) | (measured.columns["T"] > 455.0)) < 0.002

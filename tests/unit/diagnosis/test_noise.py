@@ -206,8 +206,8 @@ def test_a_noisier_sensor_is_named_with_its_further_noise_and_onset(noisier: Dia
     (cause,) = noisier.causes
     assert (noisier.verdict, cause.cause, cause.profile, noisier.location) == (NAMED, "h.noise", "step", "h")
     for name, truth, widest in (("size", 0.3, 0.05), ("onset", ONSET_MIN, 2.0)):
-        said = cause.parameters[name]
-        assert abs(said.value - truth) < 4.0 * said.sd < 4.0 * widest, name
+        stated = cause.parameters[name]
+        assert abs(stated.value - truth) < 4.0 * stated.sd < 4.0 * widest, name
     extended = parse_extended_model(json.dumps(noisier.extended_model)).build()
     assert extended.parameter("h.noise.size").value == cause.parameters["size"].value
 

@@ -56,13 +56,13 @@ def test_any_value_outside_a_signals_bounds_is_named_in_any_rows(signal: str, va
     lower, upper = BOUNDS[signal]
     assume(not lower <= value <= upper)
     record = spoiled(sound(signal), signal, sorted(rows), value)
-    with pytest.raises(InputError) as told:
+    with pytest.raises(InputError) as reported:
         make_run(record, MODELS[signal])
-    said, place = str(told.value), f"at {record.time_min[min(rows)]:g} min, column '{signal}'"
-    assert f"{record.name}, {place}: must be in [{lower:g}, {upper:g}]" in said
-    assert f"got {value:g}" in said
-    assert said.endswith("empty the cells that mean 'not measured'")
-    assert (f"and {len(rows) - 1} more of it" in said) == (len(rows) > 1)
+    stated, place = str(reported.value), f"at {record.time_min[min(rows)]:g} min, column '{signal}'"
+    assert f"{record.name}, {place}: must be in [{lower:g}, {upper:g}]" in stated
+    assert f"got {value:g}" in stated
+    assert stated.endswith("empty the cells that mean 'not measured'")
+    assert (f"and {len(rows) - 1} more of it" in stated) == (len(rows) > 1)
 
 
 @pytest.mark.parametrize("signal", ["qc", "C", "T"])

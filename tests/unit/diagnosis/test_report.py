@@ -137,10 +137,10 @@ def test_something_unknown_is_drawn_over_time_as_what_would_do_the_same() -> Non
     curves = CASES["unknown"].curves
     assert curves is not None
     assert "Size of the unknown effect" not in page("unknown")
-    told = replace(
+    reported = replace(
         curves, unknown=UnknownInputCurve("heat loss", "1/min", np.linspace(0.0, 0.01, curves.time_min.size))
     )
-    text = as_page(structs.replace(CASES["unknown"], curves=told), cstr(), EFFECTS, "a.csv", "extended.json")
+    text = as_page(structs.replace(CASES["unknown"], curves=reported), cstr(), EFFECTS, "a.csv", "extended.json")
     assert "Size of the unknown effect" in text
     assert "Estimated as the size of: heat loss, 1/min" in text
 

@@ -168,7 +168,7 @@ def test_after_a_break_it_begins_with_all_that_is_measured() -> None:
 
 
 def test_what_was_true_before_a_break_is_held_against_no_delay() -> None:
-    """In three rows in twenty the analyser shows what nobody can know; the right delay is likeliest nevertheless."""
+    """In three rows of twenty the analyser shows values of before; the right delay is likeliest nevertheless."""
     run = make_run("concentration_delay:constant:0.3", rows=1200)
     broken = Run(run.time_min, run.inputs, run.measured, breaks=tuple(range(20, 1200, 20)))
     profile = Constant(run.time_min)

@@ -64,8 +64,8 @@ def test_another_brim_and_another_share_that_is_caught_are_fitted() -> None:
     (cause,) = found.causes
     assert (found.verdict, cause.cause) == (NAMED, "overflow")
     for name, truth in (("size", 10.0), ("brim", 7.5), ("caught", 0.15)):
-        said = cause.parameters[name]
-        assert abs(said.value - truth) < 4 * said.sd < 0.4 * truth, name
+        stated = cause.parameters[name]
+        assert abs(stated.value - truth) < 4 * stated.sd < 0.4 * truth, name
     assert found.gain.held_out["x2"].rmse_after < 1.15 * NOISE_V
     extended = parse_extended_model(json.dumps(found.extended_model)).build()
     assert extended.parameter("overflow.brim").value == pytest.approx(cause.parameters["brim"].value)
@@ -85,8 +85,8 @@ def test_each_other_cause_is_named(rig: Rig, name: str, size: float) -> None:
     found = diagnose(record_of(rig, seed=3, rows=1000), tanks())
     (cause,) = found.causes
     assert (found.verdict, cause.cause) == (NAMED, name)
-    said = cause.parameters["size"]
-    assert abs(said.value - size) < 4 * said.sd < 0.2 * abs(size)
+    stated = cause.parameters["size"]
+    assert abs(stated.value - size) < 4 * stated.sd < 0.2 * abs(size)
     if rig.onset_min:
         assert cause.parameters["onset"].value == pytest.approx(rig.onset_min, abs=0.5)
     gain = found.gain.held_out["x2"]
@@ -159,9 +159,9 @@ def test_a_growing_fault_is_named_and_without_its_name_unknown_at_its_tank(
 
 
 def test_sines_that_set_in_later_on_both_pumps_are_one_explanation() -> None:
-    said = found({"pump1": 5.0 * SINE, "pump2": 3.0 * SINE})
-    assert {(item.cause, item.profile) for item in said.causes} == {("pump1", "sine"), ("pump2", "sine")}
-    for item, size in zip(sorted(said.causes, key=lambda each: each.cause), (5.0, 3.0), strict=True):
+    stated = found({"pump1": 5.0 * SINE, "pump2": 3.0 * SINE})
+    assert {(item.cause, item.profile) for item in stated.causes} == {("pump1", "sine"), ("pump2", "sine")}
+    for item, size in zip(sorted(stated.causes, key=lambda each: each.cause), (5.0, 3.0), strict=True):
         assert item.parameters["size"].value == pytest.approx(size, rel=0.1)
         assert item.parameters["onset"].value == pytest.approx(TIME_MIN[ONSET_ROW], abs=0.15)
         assert item.parameters["period"].value == pytest.approx(2.0, rel=0.01)

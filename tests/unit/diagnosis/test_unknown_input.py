@@ -80,9 +80,9 @@ def test_the_likelihood_is_that_of_the_joint_distribution(again: int) -> None:
     w, logs = normalize_columns(all_of.linear, R, all_of.kept, VARIANCE, all_of.offset, all_of.seen)
     used = all_of.linear.used.ravel()
     C = all_of.of_states[used]
-    told = multivariate_normal(C @ all_of.mean, C @ all_of.covariance @ C.T + np.diag(np.tile(R, STEPS)[used]))
+    reported = multivariate_normal(C @ all_of.mean, C @ all_of.covariance @ C.T + np.diag(np.tile(R, STEPS)[used]))
     found = -0.5 * float(np.sum(w**2)) - logs - 0.5 * np.count_nonzero(used) * np.log(2.0 * np.pi)
-    assert found == pytest.approx(float(told.logpdf(all_of.seen.ravel()[used])), rel=1e-10)
+    assert found == pytest.approx(float(reported.logpdf(all_of.seen.ravel()[used])), rel=1e-10)
 
 
 @pytest.mark.parametrize("again", [0, 4])

@@ -38,22 +38,22 @@ def parameters(found: Identification, of_sd: bool = False) -> list[float]:
 
 def test_it_prints_the_parameters_and_fits_of_the_daisy_record(daisy: Daisy) -> None:
     """Every number against LAPACK and the recursion written out, from the unscaled columns."""
-    told = identify(daisy.time, daisy.qc, daisy.T, order=3, name="T")
+    reported = identify(daisy.time, daisy.qc, daisy.T, order=3, name="T")
     half, u, y = 3750, daisy.qc, daisy.T
     k = np.arange(3, half)
     columns = [y[k - 1], y[k - 2], y[k - 3], u[k - 1], u[k - 2], u[k - 3], np.ones(k.size)]
     theta = np.linalg.lstsq(np.column_stack(columns), y[k])[0]
-    np.testing.assert_allclose([*told.a, *told.b, told.offset], theta, rtol=1e-6)
+    np.testing.assert_allclose([*reported.a, *reported.b, reported.offset], theta, rtol=1e-6)
     run, held_out, driven = list(y[half : half + 3]), y[half:], u[half:]
     for j in range(3, half):
         run.append(theta @ [run[j - 1], run[j - 2], run[j - 3], driven[j - 1], driven[j - 2], driven[j - 3], 1.0])
-    assert told.fit_percent.free_run == pytest.approx(fit_percent(held_out[3:], run[3:]), abs=1e-3)
-    assert told.fit_percent.one_step > 99.5
-    assert (told.model, told.order, told.delay, told.output, told.rows) == ("arx", 3, 1, "T", half)
-    assert told.checks["excitation"] == told.checks["sampling"] == "ok"
+    assert reported.fit_percent.free_run == pytest.approx(fit_percent(held_out[3:], run[3:]), abs=1e-3)
+    assert reported.fit_percent.one_step > 99.5
+    assert (reported.model, reported.order, reported.delay, reported.output, reported.rows) == ("arx", 3, 1, "T", half)
+    assert reported.checks["excitation"] == reported.checks["sampling"] == "ok"
     # The reactor is not linear, the record has no noise, and so the residuals cannot be white.
-    assert told.whiteness_minus_log10_p > 6.0
-    assert "leaves something out" in told.checks["whiteness"]
+    assert reported.whiteness_minus_log10_p > 6.0
+    assert "leaves something out" in reported.checks["whiteness"]
 
 
 def test_row_by_row_it_finds_what_it_finds_at_once(noisy_plant: NoisyPlant) -> None:
@@ -81,8 +81,8 @@ def test_gaps_and_missing_rows_are_left_out_where_that_is_asked_for(noisy_plant:
     y[100:103], u[500] = np.nan, np.nan
     time[1000:] += 40.0
     for recursive in (False, True):
-        told = identify(time, u, y, order=2, missing="leave out", recursive=recursive)
-        np.testing.assert_allclose(parameters(told), noisy_plant.parameters, atol=1e-8)
+        reported = identify(time, u, y, order=2, missing="leave out", recursive=recursive)
+        np.testing.assert_allclose(parameters(reported), noisy_plant.parameters, atol=1e-8)
     batch = identify(time, u, y, model="oe", order=2, missing="leave out")
     np.testing.assert_allclose(parameters(batch), noisy_plant.parameters, atol=1e-3)
 
@@ -170,17 +170,17 @@ def test_a_decay_without_inputs_is_an_output_error_model() -> None:
     [("arx", ARX, ()), ("oe", OUTPUT_ERROR, ()), ("armax", ARMAX, ("c",)), ("bj", BOX_JENKINS, ("c", "d", "f"))],
 )
 def test_the_json_has_the_promised_names(model: str, system: System, noise: tuple[str, ...]) -> None:
-    told = json.loads(msgspec.json.encode(identify_data(data_of(system), ModelForm(model, order=2)).to_dict()))
-    assert set(told) == {
+    reported = json.loads(msgspec.json.encode(identify_data(data_of(system), ModelForm(model, order=2)).to_dict()))
+    assert set(reported) == {
         *("model", "order", "delay", "output", "rows", "recursive"),
         *("a", "b", "offset", "sd", "fit_percent", "whiteness_minus_log10_p", "checks"),
         *noise,
     }
-    assert set(told["b"]) == set(told["sd"]["b"]) == {"u1", "u2"}
-    assert set(told["sd"]) == {"a", "b", "offset", *noise}
-    assert all(len(told[name]) == len(told["sd"][name]) == 2 for name in noise)
-    assert len(told["a"]) == (0 if model == "bj" else 2)
-    assert told["checks"]["whiteness"] == "ok"
+    assert set(reported["b"]) == set(reported["sd"]["b"]) == {"u1", "u2"}
+    assert set(reported["sd"]) == {"a", "b", "offset", *noise}
+    assert all(len(reported[name]) == len(reported["sd"][name]) == 2 for name in noise)
+    assert len(reported["a"]) == (0 if model == "bj" else 2)
+    assert reported["checks"]["whiteness"] == "ok"
 
 
 def test_a_record_for_validation_is_run_freely_and_all_rows_are_fitted() -> None:

@@ -160,8 +160,8 @@ def test_models_are_distinguished_by_their_purpose() -> None:
 
 
 def test_a_reconstruction_is_a_column_beside_its_signal() -> None:
-    told = [messages.Reconstruction(time_ns=at, value=440.0 + at, sd=0.5, unit="K") for at in (1, 2, 3)]
-    run = read_run(encode(Publication("reactor/cstr/reconstruction/T", item)) for item in told)
+    reported = [messages.Reconstruction(time_ns=at, value=440.0 + at, sd=0.5, unit="K") for at in (1, 2, 3)]
+    run = read_run(encode(Publication("reactor/cstr/reconstruction/T", item)) for item in reported)
     assert run.reconstructions["T"].value.tolist() == [441.0, 442.0, 443.0]
     assert run.reconstructions["T"].sd.tolist() == [0.5, 0.5, 0.5]
 

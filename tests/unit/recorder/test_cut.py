@@ -243,10 +243,10 @@ def test_what_the_files_before_hold_is_not_written_again_once(tmp_path: Path) ->
     again = recorder(
         tmp_path, 30 * SECOND, fingerprints=fingerprints, fingerprints_until_ns=90 * SECOND, black_box_min=0.0
     )
-    told = [encode(item) for item in (sample(0), sample(1), sample(1), sample(2))]
-    for message in told:
+    reported = [encode(item) for item in (sample(0), sample(1), sample(1), sample(2))]
+    for message in reported:
         again.node.on_message(Encoded(*message[:3], 31 * SECOND), 31 * SECOND)
     path = again.files.path
     again.stop()
     assert path is not None
-    assert inspect(path).overview.topics[told[0].key].count == 2
+    assert inspect(path).overview.topics[reported[0].key].count == 2

@@ -175,7 +175,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> bytes:
 
 
 def read_or_refuse(path: Path) -> list[RecordedMessage] | str:
-    """What is in a file, or the line that says why it cannot be told."""
+    """Messages of a file, or the error that refuses it."""
     try:
         return list(Recording(path).messages())
     except InputError as error:
@@ -192,10 +192,10 @@ def reads_as(path: Path, contents: Iterator[bytes]) -> list[list[RecordedMessage
 
 def test_a_file_that_is_cut_off_anywhere_is_known_as_such(tmp_path: Path, whole: bytes) -> None:
     path = tmp_path / "run.mcap"
-    for said in reads_as(path, (whole[:length] for length in range(8, len(whole), 7))):
-        assert isinstance(said, str)
-        assert said.startswith(f"{path}: is cut off")
-        assert f"`reactorwatch recover {path}`" in said
+    for stated in reads_as(path, (whole[:length] for length in range(8, len(whole), 7))):
+        assert isinstance(stated, str)
+        assert stated.startswith(f"{path}: is cut off")
+        assert f"`reactorwatch recover {path}`" in stated
 
 
 def test_a_byte_that_is_wrong_is_found_or_does_no_harm(tmp_path: Path, whole: bytes) -> None:
@@ -205,12 +205,12 @@ def test_a_byte_that_is_wrong_is_found_or_does_no_harm(tmp_path: Path, whole: by
 
     results = reads_as(tmp_path / "run.mcap", wrong())
     assert all(isinstance(result, str) or result == SAMPLES for result in results)
-    said = "\n".join(result for result in results if isinstance(result, str))
-    assert "another kind of file" in said
-    assert "is cut off" in said
-    assert "its index is damaged" in said
-    assert "the chunk at byte" in said
-    assert len(said.splitlines()) == sum(isinstance(result, str) for result in results)
+    stated = "\n".join(result for result in results if isinstance(result, str))
+    assert "another kind of file" in stated
+    assert "is cut off" in stated
+    assert "its index is damaged" in stated
+    assert "the chunk at byte" in stated
+    assert len(stated.splitlines()) == sum(isinstance(result, str) for result in results)
 
 
 def test_a_chunk_of_zeros_names_its_place_and_keeps_what_came_before(tmp_path: Path, whole: bytes) -> None:

@@ -119,6 +119,6 @@ def test_a_sample_at_time_0_is_a_sample() -> None:
     assert overview(entries[1:2]).sample_span_ns == (0, 0)
     assert overview(entries).sample_span_ns == (-SECOND, SECOND)
     assert overview([]).sample_span_ns is None
-    said = info_object(FileInfo(overview(entries[1:2]), {"zero_ns": "0"}, 0, ()), Path("x.mcap"))
-    assert (said["from_min"], said["to_min"], said["zero"]) == (0.0, 0.0, None)
+    stated = info_object(FileInfo(overview(entries[1:2]), {"zero_ns": "0"}, 0, ()), Path("x.mcap"))
+    assert (stated["from_min"], stated["to_min"], stated["zero"]) == (0.0, 0.0, None)
     assert info_object(FileInfo(overview([]), {}, 0, ()), Path("x.mcap"))["from_min"] is None

@@ -317,9 +317,9 @@ def test_a_full_file_is_followed_by_another_if_a_tenth_of_its_keys_is_inactive(i
     assert not room.needs_new_file(own[100], MINUTE_NS + 5 * SECOND_NS)  # asked once an interval
 
 
-def remembered(*told: tuple[str, Message], most: int = 100) -> LatchedMessages:
+def remembered(*reported: tuple[str, Message], most: int = 100) -> LatchedMessages:
     head = LatchedMessages(most)
-    for number, (key, message) in enumerate(told):
+    for number, (key, message) in enumerate(reported):
         head.update(RecordedMessage(key, message.SerializeToString(), "?", number, 100 + number), message)
     return head
 

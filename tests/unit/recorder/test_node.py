@@ -113,7 +113,7 @@ def test_the_defaults_record_everything() -> None:
 
 
 @pytest.mark.parametrize(
-    ("values", "said"),
+    ("values", "stated"),
     [
         ({"plant": "a/b"}, "plant name must be"),
         ({"health_period_s": 0.0}, "health_period_s must be positive and finite, got 0.0"),
@@ -129,8 +129,8 @@ def test_the_defaults_record_everything() -> None:
         ({"period": 1}, "unknown key 'period'"),
     ],
 )
-def test_an_impossible_setting_is_reported_in_one_line(values: dict[str, object], said: str) -> None:
-    with pytest.raises(InputError, match=said):
+def test_an_impossible_setting_is_reported_in_one_line(values: dict[str, object], stated: str) -> None:
+    with pytest.raises(InputError, match=stated):
         section(RecorderConfig, "recorder", {"recorder": values}, {})
 
 

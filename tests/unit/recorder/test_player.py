@@ -269,11 +269,11 @@ def test_standing_alarms_are_due_with_the_first_sample(rate: float) -> None:
 @pytest.mark.parametrize("kind", LATCHED_KINDS)
 def test_latched_messages_of_every_kind_are_due_with_the_first_sample(kind: str) -> None:
     latched = Publication(keys.key("cstr", kind, "x"), LATCHED_KINDS[kind](time_ns=0))  # type: ignore[arg-type]
-    said = list[float]()
-    player = Player(lambda: iter([latched, sampled(18_000), sampled(18_001)]), 1.0, on_wait=said.append)
+    stated = list[float]()
+    player = Player(lambda: iter([latched, sampled(18_000), sampled(18_001)]), 1.0, on_wait=stated.append)
     assert player.on_tick(0) == [latched, sampled(18_000)]
     assert player.next_tick_ns() == SECOND_NS
-    assert not said
+    assert not stated
 
 
 @pytest.mark.parametrize(
@@ -291,10 +291,10 @@ def test_latched_messages_of_every_kind_are_due_with_the_first_sample(kind: str)
 def test_a_wait_of_more_than_a_minute_for_a_jump_of_the_clock_is_reported(
     seconds: list[float], rate: float, waits: list[float]
 ) -> None:
-    said = list[float]()
-    player = Player(lambda: iter([sampled(second) for second in seconds]), rate, on_wait=said.append)
+    stated = list[float]()
+    player = Player(lambda: iter([sampled(second) for second in seconds]), rate, on_wait=stated.append)
     now_ns = 0
     while not player.finished:
         player.on_tick(now_ns)
         now_ns = max(now_ns, player.next_tick_ns())
-    assert said == pytest.approx(waits)
+    assert stated == pytest.approx(waits)

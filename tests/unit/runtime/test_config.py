@@ -235,16 +235,16 @@ def test_endpoints_of_every_protocol_are_taken(protocol: str, host: str) -> None
 
 @pytest.mark.parametrize("key", ["endpoint", "routers"])
 @pytest.mark.parametrize(
-    ("endpoint", "said"),
+    ("endpoint", "stated"),
     [
         *((f"tcp/127.0.0.1:{port}", "port of an endpoint must be in") for port in (0, 65536, 99999, "1" * 5000, "x²")),
         *((f"{protocol}/127.0.0.1:1", "one of tcp/, tls/, udp/, ws/") for protocol in ("foo", "TCP", "http", " tcp")),
         *((text, "endpoint must be like") for text in ("foo/", "tcp/", "tcp/:1", "a/b/c:1", "127.0.0.1:1")),
     ],
 )
-def test_an_endpoint_that_can_never_be_reached_is_refused_at_once(key: str, endpoint: str, said: str) -> None:
+def test_an_endpoint_that_can_never_be_reached_is_refused_at_once(key: str, endpoint: str, stated: str) -> None:
     table = {key: [endpoint] if key == "routers" else endpoint}
-    with pytest.raises(InputError, match=said):
+    with pytest.raises(InputError, match=stated):
         section(BusConfig, "bus", {"bus": table}, {})
 
 

@@ -25,9 +25,9 @@ def test_for_programs_each_line_is_an_object_with_the_fields_of_the_event(capsys
     log.info("alarm", alarm="ewma/T", value=3.5, file=Path("a.mcap"))
     log.warning("a second\nline")
     first, second = map(json.loads, capsys.readouterr().err.splitlines())
-    said = datetime.fromisoformat(first.pop("timestamp"))
-    assert said.tzinfo is not None
-    assert abs(datetime.now(UTC) - said) < timedelta(minutes=1)
+    stated = datetime.fromisoformat(first.pop("timestamp"))
+    assert stated.tzinfo is not None
+    assert abs(datetime.now(UTC) - stated) < timedelta(minutes=1)
     assert first == {"event": "alarm", "level": "info", "alarm": "ewma/T", "value": 3.5, "file": "a.mcap"}
     assert (second["event"], second["level"]) == ("a second\nline", "warning")
 
@@ -73,8 +73,8 @@ def test_lines_that_a_full_disk_refuses_are_counted_and_the_next_one_reports_it(
     disk.is_full = False
     log.write("second\n")
     log.write("third\n")
-    said = "lines of the log that could not be written: 3"
-    assert disk.getvalue().splitlines() == ["first", said, "second", "third"]
+    stated = "lines of the log that could not be written: 3"
+    assert disk.getvalue().splitlines() == ["first", stated, "second", "third"]
 
 
 def test_a_process_whose_log_cannot_be_written_runs_to_its_own_end() -> None:
@@ -146,14 +146,14 @@ def test_an_error_within_a_node_process_is_one_line(
     with pytest.raises(SystemExit) as ended:
         runpy.run_module(module, run_name="__main__", alter_sys=False)
     assert ended.value.code == code
-    *_, said = ["", *capsys.readouterr().err.splitlines()]
+    *_, stated = ["", *capsys.readouterr().err.splitlines()]
     if line is None:
-        assert "Traceback" not in said
+        assert "Traceback" not in stated
         return
-    found = re.search(line, said)
-    assert found is not None, said
+    found = re.search(line, stated)
+    assert found is not None, stated
     if code == EXIT_CODE:
-        assert "\x1b" not in said
+        assert "\x1b" not in stated
         assert "Traceback (most recent call last)" in Path(found[1]).read_text(encoding="utf-8")
 
 

@@ -73,20 +73,20 @@ def test_the_size_of_every_cause_is_stated_with_its_unit_and_meaning(effect: Eff
             location=effect.location,
             parameters={"size": size} | constants,
         )
-        said = describe_size(cause, (effect,))
+        stated = describe_size(cause, (effect,))
         unit = "%" if "%" in effect.larger else effect.unit
         value = abs(size.value) * (100.0 if unit == "%" else 1.0)
-        number = re.search(r"-?\d[\d.]*", said)
+        number = re.search(r"-?\d[\d.]*", stated)
         assert number is not None
         assert abs(float(number.group())) == pytest.approx(value, rel=0.02)
-        half = re.search(r"± ([\d.]+)", said)
+        half = re.search(r"± ([\d.]+)", stated)
         assert half is not None
         assert float(half.group(1)) == pytest.approx(0.0196 * value, rel=0.3)
-        assert unit in said or unit == "1"
+        assert unit in stated or unit == "1"
         if profile != "sine":
-            assert "-" not in said  # the words tell the direction
+            assert "-" not in stated  # the words tell the direction
             words = effect.larger if sign > 0.0 else effect.smaller
-            assert all(part.strip() in said for part in words.split("{}"))
+            assert all(part.strip() in stated for part in words.split("{}"))
 
 
 def test_more_and_less_have_different_words() -> None:
@@ -117,14 +117,14 @@ def test_people_read_sizes_onsets_rivals_experiment_gain_and_remarks() -> None:
 
 @pytest.mark.parametrize("case", CASES)
 def test_the_object_has_the_keys_that_are_promised_and_nothing_else(case: str) -> None:
-    said = json.loads(msgspec.json.encode(CASES[case].to_dict()))
-    assert list(said) == [
+    stated = json.loads(msgspec.json.encode(CASES[case].to_dict()))
+    assert list(stated) == [
         "file", "zero", "samples", "runs", "span_min", "seconds", "verdict", "causes", "alternatives", "location",
         "locations", "law", "significant", "practical", "gain", "adequacy", "experiment", "extended_model",
     ]  # fmt: skip
-    for item in said["gain"]["held_out"].values():
+    for item in stated["gain"]["held_out"].values():
         assert list(item) == ["rmse_before", "rmse_after", "noise_sd", "unit"]
-    for cause in [*said["causes"], *(cause for item in said["alternatives"] for cause in item["causes"])]:
+    for cause in [*stated["causes"], *(cause for item in stated["alternatives"] for cause in item["causes"])]:
         assert list(cause) == ["cause", "profile", "label", "location", "parameters"]
         assert next(iter(cause["parameters"])) == "size"
         assert all(list(item) == ["value", "sd", "unit"] for item in cause["parameters"].values())
@@ -143,13 +143,13 @@ def test_a_law_has_its_intervals_its_rivals_and_its_range() -> None:
 
 
 def test_the_object_holds_what_was_found() -> None:
-    said = CASES["ambiguous"].to_dict()
-    assert said["causes"][0]["parameters"]["onset"] == {"value": 150.3349, "sd": 0.0122, "unit": "min"}
-    (alternative,) = said["alternatives"]
+    stated = CASES["ambiguous"].to_dict()
+    assert stated["causes"][0]["parameters"]["onset"] == {"value": 150.3349, "sd": 0.0122, "unit": "min"}
+    (alternative,) = stated["alternatives"]
     assert alternative["delta_bic"] == 3.21
     assert alternative["causes"][0]["cause"] == "feed_temperature"
     assert alternative["causes"][0]["parameters"]["size"] == {"value": 1.234, "sd": 0.05, "unit": "K"}
-    assert said["experiment"] == {
+    assert stated["experiment"] == {
         "why": "Wider steps of qc tell both apart.",
         "input": [[0.0, 103.4], [10.0, 90.0]],
         "separates": ["coolant_flow", "feed_temperature"],
@@ -164,8 +164,8 @@ def test_the_object_holds_what_was_found() -> None:
             "feed_temperature": {"C": [0.06, 0.11], "T": [438.4, 448.8]},
         },
     }
-    assert said["adequacy"]["T"] == {"minus_log10_p": 0.35}
-    assert said["gain"]["held_out"]["T"]["rmse_before"] is None  # it ran away
+    assert stated["adequacy"]["T"] == {"minus_log10_p": 0.35}
+    assert stated["gain"]["held_out"]["T"]["rmse_before"] is None  # it ran away
     assert CASES["nominal"].to_dict()["location"] is None
 
 
@@ -175,15 +175,15 @@ def test_an_uncertain_parameter_is_reported_with_its_posterior() -> None:
         "and the rest of the record is noise."
     )
     assert "parameter   K3 711 ± 3 l/min; stated: 700 ± 30 l/min  (95 %)" in diagnosis_text(ADJUSTED, EFFECTS)
-    said = ADJUSTED.to_dict()["parameters"]
-    assert list(said) == ["K3", "Tf"]
-    assert said["K3"] == {"nominal": 700.0, "stated_sd": 14.0, "value": 711.2, "sd": 1.5, "unit": "l/min"}
+    stated = ADJUSTED.to_dict()["parameters"]
+    assert list(stated) == ["K3", "Tf"]
+    assert stated["K3"] == {"nominal": 700.0, "stated_sd": 14.0, "value": 711.2, "sd": 1.5, "unit": "l/min"}
 
 
 @pytest.mark.parametrize("case", CASES)
 def test_the_report_for_machines_adds_where_the_simulation_differs(case: str) -> None:
-    said = json.loads(msgspec.json.encode(CASES[case].to_dict("differences")))
-    assert said.keys() - CASES[case].to_dict().keys() == {"differences"}
-    for name, item in said["differences"].items():
+    stated = json.loads(msgspec.json.encode(CASES[case].to_dict("differences")))
+    assert stated.keys() - CASES[case].to_dict().keys() == {"differences"}
+    for name, item in stated["differences"].items():
         assert item["unit"] == CASES[case].gain.held_out[name].unit
         assert sum(part["rows"] for part in item["along"]["time"]) == ROWS
