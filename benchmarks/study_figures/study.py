@@ -86,7 +86,6 @@ def verdict(agrees: bool) -> Verdict:
 BLACK, GREY = "#000000", "#8c8c8c"
 BLUE, ORANGE, GREEN, VERMILION = "#0072B2", "#E69F00", "#009E73", "#D55E00"
 SKY, PURPLE = "#56B4E9", "#CC79A7"
-BY_ORDER = {1: ORANGE, 2: BLUE, 3: VERMILION}
 
 WIDTH_PX = 900
 _PALETTE = 256  # colours in a file: a third of the bytes
