@@ -128,9 +128,12 @@ def run_command(run: Callable[[], int]) -> NoReturn:
     def until_interrupted() -> int:
         try:
             return run()
-        except (typer.Abort, KeyboardInterrupt):
-            clear_interrupt()
-            return INTERRUPTED
+        except BaseException as error:
+            # raised within compiled code, an interrupt is the cause of a SystemError
+            if isinstance(error, typer.Abort) or _is_handled(error):
+                clear_interrupt()
+                return INTERRUPTED
+            raise
 
     code = guard(NAME, until_interrupted)
     gc.freeze()  # the process ends: garbage collection of a million objects would take a third of a second
@@ -184,7 +187,7 @@ def _interrupt(number: int, frame: FrameType | None) -> None:
 
 
 def _is_handled(error: BaseException | None) -> bool:
-    """True while an interrupt is handled, also by closing a generator, whose GeneratorExit has it as context."""
+    """True for an interrupt and for what it led to, such as the GeneratorExit of a generator that it closes."""
     while error is not None:
         if isinstance(error, KeyboardInterrupt):
             return True

@@ -4,7 +4,7 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Generator, Iterator
+from collections.abc import Callable, Generator, Iterator
 from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ import typer
 from llvmlite.binding import ExecutionEngine, create_pass_builder
 from llvmlite.binding.ffi import ObjectRef
 
-from reactorwatch.cli.main import _BINDING, COMMANDS, app, clear_interrupt, main, raise_until_handled
+from reactorwatch.cli.main import _BINDING, COMMANDS, app, clear_interrupt, main, raise_until_handled, run_command
 from reactorwatch.codegen.numba_kernel import jit
 from tests.running import WITHIN_S
 
@@ -215,6 +215,33 @@ def test_nothing_is_raised_while_a_generator_is_closed_for_an_interrupt() -> Non
     with pytest.raises(KeyboardInterrupt):
         command()
     assert is_closed
+
+
+def interrupt_within_compiled_code() -> int:
+    """As CPython reports it when compiled code returns a result in spite of the exception of a function it called."""
+    try:
+        signal.raise_signal(signal.SIGINT)
+    except KeyboardInterrupt as interrupt:
+        raise SystemError("returned a result with an exception set") from interrupt
+    return 0
+
+
+def interrupt_before_a_failing_cleanup() -> int:
+    opened: list[int] = []
+    try:
+        signal.raise_signal(signal.SIGINT)
+    finally:
+        opened.pop()
+    return 0
+
+
+@pytest.mark.parametrize("work", [interrupt_within_compiled_code, interrupt_before_a_failing_cleanup])
+def test_an_error_that_an_interrupt_led_to_ends_the_command_as_the_interrupt(
+    work: Callable[[], int], capfd: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        run_command(work)
+    assert (ended.value.code, capfd.readouterr().err) == (130, "")
 
 
 @pytest.mark.parametrize("part", [ExecutionEngine, ObjectRef, create_pass_builder])
