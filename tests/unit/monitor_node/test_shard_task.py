@@ -1,4 +1,4 @@
-"""What runs in the event loops of a Dask cluster: it imports nothing that takes time, and runs any monitor."""
+"""The task of a shard, which runs in the event loops of a Dask cluster: its imports, its result, its end."""
 
 import asyncio
 import subprocess
