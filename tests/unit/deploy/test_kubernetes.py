@@ -184,13 +184,20 @@ def test_what_a_container_writes_is_on_a_volume(folder: Path) -> None:
 
 
 @both
-def test_a_monitor_starts_with_the_compiled_kernels_of_the_image_on_a_volume(folder: Path) -> None:
+def test_a_monitor_starts_with_the_compiled_kernels_of_the_image_on_a_volume(folder: Path, tmp_path: Path) -> None:
     """Numba reads no cache that it cannot write to, and an empty volume in its place hides the image's."""
     monitor = workloads(folder)["monitor"]
     (first,) = pod(monitor)["initContainers"]
     (mount,) = first["volumeMounts"]
     assert {**mount, "mountPath": "/home/reactorwatch/.cache"} in container(monitor)["volumeMounts"]
-    assert first["command"] == ["cp", "-R", "/home/reactorwatch/.cache/.", mount["mountPath"]]
+    kernel = tmp_path / "home" / "numba" / "kernel.nbc"
+    kernel.parent.mkdir(parents=True)
+    kernel.write_bytes(b"code")
+    (tmp_path / "volume").mkdir()
+    outside = {"/home/reactorwatch/.cache/.": f"{tmp_path}/home/.", mount["mountPath"]: f"{tmp_path}/volume"}
+    for _ in range(2):  # a pod may start it again
+        subprocess.run([outside.get(word, word) for word in first["command"]], check=True)
+    assert (tmp_path / "volume" / "numba" / "kernel.nbc").read_bytes() == b"code"
     assert first["image"] == container(monitor)["image"]
     assert "NUMBA_CACHE_DIR=/home/reactorwatch/.cache/" in (ROOT / "Dockerfile").read_text(encoding="utf-8")
 
