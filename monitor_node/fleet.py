@@ -9,6 +9,7 @@ name, the same on every machine and in every version, and never changes.
 Nothing here reads a clock or does I/O.
 """
 
+import re
 from collections.abc import Callable, Sequence
 from fnmatch import fnmatchcase
 from hashlib import blake2b
