@@ -241,7 +241,9 @@ def place_shards(
 
 def status(
     *,
-    nodes: Annotated[list[str] | None, Argument(help="With --check: these nodes [all that publish health].")] = None,
+    nodes: Annotated[
+        list[str] | None, Argument(help="With --check: these nodes, or shards such as 2/5 [all that publish health].")
+    ] = None,
     target: ClientOptions,
     chosen: ProcessOption,
     check: Annotated[
