@@ -118,4 +118,4 @@ def watch(node: MonitorNode, bus: Bus, stop: StopSignal, history_s: float = 0.0)
 
 
 if __name__ == "__main__":
-    sys.exit(main("monitor_node", "monitor", MonitorConfig, run))
+    sys.exit(main("monitor_node", "monitor", MonitorConfig, run, fleet=FleetConfig))

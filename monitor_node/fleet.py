@@ -98,6 +98,11 @@ class FleetConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             holds however the plants depend on each other. None: only each plant's own number is promised.
         most_plants: largest number of plants among which it is divided.
         points: True to publish estimates, chart points and models for every row.
+        shards: number of shards that the command `monitor` places on the workers of a Dask cluster.
+        scheduler: address of its scheduler, such as `tls://10.0.0.3:8786`. Where it is set, other machines may use the
+            folder of states.
+        identity: folder with ca.pem, certificate.pem and key.pem for its connections; in a settings file, the path is
+            relative to that file's folder. None: with `tls://` the certificate of the bus.
     """
 
     plants: str | None = None
@@ -107,10 +112,17 @@ class FleetConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     false_alarms_per_day: Annotated[float, msgspec.Meta(ge=1e-4, le=1e6)] | None = None
     most_plants: Annotated[int, msgspec.Meta(ge=1, le=100_000)] = 100
     points: bool = False
+    shards: Annotated[int, msgspec.Meta(ge=1, le=1000)] | None = None
+    scheduler: str | None = None
+    identity: str | None = None
 
     def __post_init__(self) -> None:
         if self.plants is not None:
             keys.check_plants(self.plants)
+        if self.scheduler is not None and re.fullmatch(r"(tcp|tls)://\S+:\d{1,5}", self.scheduler) is None:
+            raise ValueError(
+                f"scheduler must be like tls://10.0.0.3:8786 or tcp://127.0.0.1:8786, got {self.scheduler!r}"
+            )
         try:
             parse_shard(self.shard)
         except InputError as error:

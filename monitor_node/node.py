@@ -34,6 +34,9 @@ POLL_NS = 100_000_000
 
 Such a step takes some hundredths of a second, at most a few tenths; samples are handled between two steps."""
 
+CLAIM_NS = 1_000_000_000
+"""Interval of looks at the claim of a shared folder: a monitor that was replaced while it was stalled ends at once."""
+
 PREPARED = object()
 """Marks the end of the preparation."""
 
@@ -89,7 +92,7 @@ class MonitorNode(FleetMonitor):
         self._changed: set[str] = set()  # plants with a changed alarm or a command since their state was stored
         self._round: list[str] = []  # plants to check for new messages
         self._stored_at: dict[str, int] = {}  # number of messages by plant when its state was stored
-        self._round_ns = self._poll_ns = self._report_ns = start_ns
+        self._round_ns = self._poll_ns = self._report_ns = self._claim_ns = start_ns
         self._repeated: list[Publication] = []  # a kill may have kept them from leaving the process
         self._logged: dict[str, str] = {}  # the last failure to store a plant's state
         self._kpi_keys: set[str] = set()  # keys of KPIs that are not empty
@@ -106,7 +109,7 @@ class MonitorNode(FleetMonitor):
         if self.is_single and config.state_file is not None:
             self._states = StateStore(Path(config.state_file), config.plant)
         elif fleet.state is not None:
-            self._states = StateStore(make_folder(Path(fleet.state), "--state"))
+            self._states = StateStore(make_folder(Path(fleet.state), "--state"), shared=fleet.scheduler is not None)
         for plant in self._plants_at_start(config):
             self.register(plant, start_ns, verified=True, restore=self._restore)
         if self._states is not None and self._states.claim.failure:
@@ -292,6 +295,9 @@ class MonitorNode(FleetMonitor):
         Raises:
             InputError: another monitor has claimed the state, and publishes these alarms.
         """
+        if self._states is not None and not 0 <= now_ns - self._claim_ns < CLAIM_NS:
+            self._states.claim.check()
+            self._claim_ns = now_ns
         if self._repeated:
             publications, self._repeated = self._repeated + publications, []
         if publications:

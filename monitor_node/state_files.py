@@ -7,10 +7,10 @@ left alone.
 
 A monitor claims its file or folder. On a local file system a claim is a lock of the kernel (`flock`), which ends with
 the process, by whatever means; a second monitor is refused. Locks of a network file system may be local to each
-machine, or outlive a machine that is gone. So there a claim is a file with the token of the last monitor that claimed.
-The previous one may be stalled at any instruction, and not know that it was replaced. It reads the claim after it has
-evaluated messages and before it publishes an alarm or writes a state, so after a stall of any length before the check
-it does neither, and ends.
+machine, or outlive a machine that is gone. So there, and for the shards on a cluster, a claim is a file with the token
+of the last monitor that claimed. The previous one may be stalled at any instruction, and not know that it was replaced.
+It reads the claim after it has evaluated messages and before it publishes an alarm or writes a state, and every second,
+so after a stall of any length before the check it does neither, and ends.
 """
 
 import contextlib
@@ -44,6 +44,7 @@ class Claim:
     Args:
         path: file of the claim.
         thing: what is claimed, as the errors name it.
+        shared: True if other machines may use it, also where the file system seems to be local.
 
     Raises:
         InputError: another monitor uses it.
@@ -52,14 +53,14 @@ class Claim:
         failure: reason why it could not be claimed; empty: it is. Then no other monitor is refused.
     """
 
-    def __init__(self, path: Path, thing: str) -> None:
+    def __init__(self, path: Path, thing: str, *, shared: bool = False) -> None:
         self._path, self._thing, self.failure = path, thing, ""
         self._token: bytes | None = None
         self._close: Callable[[], object] = lambda: None
         try:
             file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_NONBLOCK, 0o644)  # a pipe is refused, not waited for
             self._close = weakref.finalize(self, os.close, file)
-            if is_local(path.parent):
+            if not shared and is_local(path.parent):
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 return
             token = secrets.token_hex(8).encode()
@@ -188,13 +189,14 @@ class StateStore:
     Args:
         path: folder of the states, `PLANT.state`; or the file of one plant.
         plant: the one plant; None: the path is a folder.
+        shared: see `Claim`.
 
     Raises:
         InputError: the folder cannot be read or made, is no folder, or another monitor uses the file or the folder. One
             that cannot be written to at the moment is no error.
     """
 
-    def __init__(self, path: Path, plant: str | None = None) -> None:
+    def __init__(self, path: Path, plant: str | None = None, *, shared: bool = False) -> None:
         self._path, self._only = path, plant
         folder = path if plant is None else path.parent
         self._name = f"state folder {path}" if plant is None else f"state_file {path}"
@@ -210,7 +212,8 @@ class StateStore:
             self._aside = find_kept_aside(folder)
         except OSError as error:
             raise InputError(f"{self._name}: cannot be read or renamed: {error.strerror}") from error
-        self.claim = Claim(folder / CLAIM if plant is None else path.with_name(f".{path.name}{CLAIM}"), self._name)
+        claim = folder / CLAIM if plant is None else path.with_name(f".{path.name}{CLAIM}")
+        self.claim = Claim(claim, self._name, shared=shared)
 
     @property
     def plants(self) -> list[str]:

@@ -23,7 +23,10 @@ from reactorwatch.errors import InputError
 from reactorwatch.records.file_format import GUESS
 
 if TYPE_CHECKING:
+    from monitor_node.config import MonitorConfig
+    from monitor_node.fleet import FleetConfig
     from reactorwatch.description.read import ProcessChoice
+    from reactorwatch.runtime.config import BusConfig
 
 
 def up(
@@ -131,6 +134,12 @@ def monitor(
     ] = None,
     plants: Annotated[str | None, Option(help="Watch all of these plants: 'reactor/*', 'reactor/north_*'.")] = None,
     shard: Annotated[str | None, Option(help="With --plants: this monitor's part of them, such as 2/5 [1/1].")] = None,
+    shards: Annotated[
+        int | None, Option(help="With --plants and --scheduler: watch them by so many monitors, a shard each.")
+    ] = None,
+    scheduler: Annotated[
+        str | None, Option(help="With --shards: Dask cluster on which they run, such as tls://10.0.0.3:8786.")
+    ] = None,
 ) -> None:
     """Watch a plant, or a fleet of them: predict signals, raise alarms."""
     from contextlib import nullcontext
@@ -151,7 +160,13 @@ def monitor(
     if choice.outputs:
         flags |= {"inputs": list(choice.inputs), "outputs": list(choice.outputs)}
     flags |= training.flags(tables)
-    of_fleet = {"plants": plants, "shard": shard, "state": str(state) if state is not None else None}
+    of_fleet = {
+        "plants": plants,
+        "shard": shard,
+        "state": str(state) if state is not None else None,
+        "shards": shards,
+        "scheduler": scheduler,
+    }
     fleet = section(FleetConfig, "fleet", tables, of_fleet)
     if state is not None and fleet.plants is None:
         flags["state_file"] = str(state / "monitor.state")
@@ -165,6 +180,11 @@ def monitor(
         raise InputError("--shard is a part of the plants that --plants names; give both")
     if state is not None:
         check_folder_name(state, "--state")
+    if fleet.shards is not None or scheduler is not None:
+        if shard is not None:
+            raise InputError("--shard is one part of the plants, and --shards are all of them; give one of both")
+        place_shards(tables, bus, config_of_monitor, fleet)
+        return
     if is_first_start() and fleet.plants is None:
         load_process(config_of_monitor)  # its errors are not half a minute late
     compile_at_first_start()
@@ -174,6 +194,49 @@ def monitor(
     diagnosis = diagnosis_settings(tables, config_of_monitor, diagnose)
     with run_diagnosis_node(diagnosis, bus, section(LogConfig, "log", tables, {})) if diagnosis.out else nullcontext():
         run(config_of_monitor, bus, metrics_settings(tables), state=state)
+
+
+def place_shards(
+    tables: dict[str, dict[str, Any]], bus: "BusConfig", config: "MonitorConfig", fleet: "FleetConfig"
+) -> None:
+    """Keep the shards of a fleet running on a Dask cluster; workers see files under the same paths as this machine."""
+    from msgspec.structs import replace
+
+    from monitor_node.fleet import Shard, load_kinds
+    from monitor_node.placement import cluster_security, place
+    from reactorwatch.cli.bus_client import metrics_settings
+    from reactorwatch.cli.processes import settings_text
+    from reactorwatch.runtime.config import IDENTITY, LogConfig, section
+    from reactorwatch.runtime.event_loop import stop_on_signals
+
+    needed = {
+        "--plants": fleet.plants,
+        "--shards": fleet.shards,
+        "--scheduler": fleet.scheduler,
+        "--state": fleet.state,
+    }
+    for option, given in needed.items():
+        if given is None:
+            raise InputError(
+                f"shards on a cluster need {', '.join(needed)}, a folder that all workers see; add {option}"
+            )
+    load_kinds(fleet.share_promise(config), fleet)  # errors in the settings are those of this command
+    cluster_security(fleet, bus)
+
+    def absolute(name: str | None) -> str | None:
+        return str(Path(name).absolute()) if name is not None and Path(name).exists() else name
+
+    bus = replace(bus, **{name: absolute(getattr(bus, name)) for name in IDENTITY})
+    config = replace(config, process=absolute(config.process))
+    fleet = replace(fleet, processes={plants: str(absolute(name)) for plants, name in fleet.processes.items()})
+    others = {"metrics": metrics_settings(tables), "log": section(LogConfig, "log", tables, {})}
+    folder, count = Path(str(fleet.state)).absolute(), int(fleet.shards or 1)
+    settings = {}
+    for shard in (str(Shard(number, count)) for number in range(1, count + 1)):
+        own = replace(fleet, shard=shard, shards=None, state=str(folder / shard.replace("/", "-of-")))
+        settings[shard] = settings_text({"bus": bus, "monitor": config, "fleet": own, **others})
+    with stop_on_signals() as stop:
+        place(fleet, bus, settings, stop)
 
 
 def status(

@@ -274,10 +274,11 @@ def read_settings(path: Path | None) -> dict[str, dict[str, Any]]:
             raise InputError(f"settings file {path}: {describe_unknown('table', name, SECTIONS)}")
     if "limits" in tables:
         set_limits(section(Limits, "limits", tables, {}))
-    bus = tables.get("bus", {})
-    for name in IDENTITY:
-        if isinstance(bus.get(name), str):  # a folder with settings and certificates can be moved
-            bus[name] = str(path.parent / bus[name])
+    for table, names in (("bus", IDENTITY), ("fleet", ("identity",))):
+        settings = tables.get(table, {})
+        for name in names:
+            if isinstance(settings.get(name), str):  # a folder with settings and certificates can be moved
+                settings[name] = str(path.parent / settings[name])
     return tables
 
 

@@ -304,6 +304,20 @@ CONNECT_WITHIN_S = 10.0  # a wrong address is reported while its user waits
 WORKERS_WITHIN_S = 60.0  # a worker on a busy machine takes half a minute to start
 
 
+def check_dask(address: str) -> None:
+    """Check that Dask is installed and that an address can be that of a scheduler.
+
+    Raises:
+        InputError: it is not, or cannot.
+    """
+    try:
+        import distributed  # noqa: F401
+    except ImportError as missing:
+        raise InputError("--scheduler needs Dask: pip install 'reactorwatch[cluster]'") from missing
+    if "://" not in address:
+        raise InputError(f"--scheduler must be an address like tcp://127.0.0.1:8786, got {address!r}")
+
+
 class DaskExecutor:
     """Runs jobs on the workers of a cluster.
 
@@ -315,12 +329,7 @@ class DaskExecutor:
     """
 
     def __init__(self, address: str) -> None:
-        try:
-            import distributed  # noqa: F401
-        except ImportError as missing:
-            raise InputError("--scheduler needs Dask: pip install 'reactorwatch[cluster]'") from missing
-        if "://" not in address:
-            raise InputError(f"--scheduler must be an address like tcp://127.0.0.1:8786, got {address!r}")
+        check_dask(address)
         self._address = address
 
     def map_unordered(

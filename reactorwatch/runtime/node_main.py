@@ -41,14 +41,17 @@ SUPERVISED = "--supervised"
 """Last argument of a node that ends, as by SIGTERM, when its standard input does: its supervisor has ended."""
 
 
-def main(module: str, table: str, kind: type[Config], run: Callable[[Config, BusConfig, MetricsConfig], object]) -> int:
+def main(
+    module: str, table: str, kind: type[Config], run: Callable[..., object], **others: type[msgspec.Struct]
+) -> int:
     """Read the settings file that the command line names, and run the node.
 
     Args:
         module: module of the node, for the usage line.
         table: name of the node's table in the settings file.
         kind: class of its settings.
-        run: runs the node.
+        run: runs the node, with its settings, those of the bus and of the metrics, and others by name.
+        others: classes of other settings, by the name of their table.
 
     Returns:
         The exit code, see `guard`.
@@ -69,6 +72,7 @@ def main(module: str, table: str, kind: type[Config], run: Callable[[Config, Bus
             section(kind, table, tables, {}),
             section(BusConfig, "bus", tables, {}),
             section(MetricsConfig, "metrics", tables, {}),
+            **{name: section(other, name, tables, {}) for name, other in others.items()},
         )
         return 0
 
