@@ -175,9 +175,10 @@ def _draw_cluster_blows(draw: random.Random, rows: int, rows_per_s: float, shard
     kinds = draw.sample(list(CLUSTER_KINDS), len(CLUSTER_KINDS))
     repeated = [kind for kind in kinds if kind.endswith("worker")]
     kinds += [repeated[number % len(repeated)] for number in range(count - len(kinds))]
+    last = rows - LAST_ROWS - max(CLUSTER_KINDS.values()) * rows_per_s
     return tuple(
         Blow(
-            row=round(number * (rows - LAST_ROWS) / (count + 1)),
+            row=round(number * last / count),
             kind=kind,
             manner="stalled",
             monitor=draw.randrange(shards),
