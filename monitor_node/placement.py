@@ -17,20 +17,17 @@ first has disappeared, and then claims the folder of states, which the first one
 """
 
 import asyncio
-import os
-import sys
 import time
-from asyncio.subprocess import PIPE, Process
 from collections.abc import Collection, Mapping
 from contextlib import suppress
 from hashlib import blake2b
 from pathlib import Path
-from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import structlog
 
 from monitor_node.fleet import FleetConfig
+from monitor_node.shard_task import end_shards, run_shard
 from reactorwatch.errors import InputError
 from reactorwatch.runtime.config import IDENTITY, BusConfig
 from reactorwatch.runtime.event_loop import StopSignal, describe
@@ -48,6 +45,9 @@ log = structlog.get_logger()
 RESOURCE = "monitor"
 """Dask's name for what a shard takes of a worker."""
 
+ARGUMENTS = ("-P", "-m", "monitor_node", "{settings}", SUPERVISED)
+"""Python's arguments for a monitor."""
+
 LOOK_S = 5.0
 """Interval of looks at where the shards run."""
 
@@ -56,59 +56,6 @@ LONGEST_PAUSE_S = 30.0
 
 END_WITHIN_S = 30.0
 """A monitor that is asked to end stores its states and leaves the bus within seconds."""
-
-_running: dict[str, Process] = {}
-"""Monitors of this worker, by key of the task."""
-
-
-class Ended(NamedTuple):
-    """End of a shard's monitor: its exit code, and its last line on standard error."""
-
-    exit_code: int
-    why: str
-
-
-async def run_shard(key: str, settings: str, client_version: str) -> Ended:
-    """Run the monitor of a shard until it ends or the worker does; this is a task on a worker.
-
-    Args:
-        key: key of the task.
-        settings: text of the monitor's settings file.
-        client_version: version of this software at the client.
-
-    Raises:
-        InputError: the worker has another version of this software.
-    """
-    if version() != client_version:
-        raise InputError(f"the worker has reactorwatch {version()}, the command {client_version}; install the same")
-    with TemporaryDirectory(prefix="reactorwatch-") as folder:
-        path = Path(folder) / "settings.toml"
-        path.write_text(settings, encoding="utf-8")
-        command = (sys.executable, "-P", "-m", "monitor_node", str(path), SUPERVISED)
-        process = await asyncio.create_subprocess_exec(*command, stdin=PIPE, stderr=PIPE)
-        _running[key] = process
-        assert process.stdin is not None
-        assert process.stderr is not None
-        tail = b""
-        try:
-            while block := await process.stderr.read(65_536):
-                os.write(sys.stderr.fileno(), block)  # its log is the worker's
-                tail = (tail + block)[-4096:]
-        finally:  # also if the worker closes
-            process.stdin.close()
-            code = await process.wait()
-            del _running[key]
-    lines = tail.decode(errors="replace").split("\n")
-    return Ended(code, next((line for line in reversed(lines) if line.strip()), ""))
-
-
-async def end_shards(beginning: str, but: Collection[str] = ()) -> None:
-    """End the monitors of this worker whose key has a beginning, but for some; this runs on each worker."""
-    ending = [process for key, process in _running.items() if key.startswith(beginning) and key not in but]
-    for process in ending:
-        assert process.stdin is not None
-        process.stdin.close()
-    await asyncio.gather(*(process.wait() for process in ending))
 
 
 def cluster_security(fleet: FleetConfig, bus: BusConfig) -> "Security | None":
@@ -209,7 +156,7 @@ class _Placement:
         self._due_s = dict.fromkeys(self._shards, 0.0)  # time of the next submission
         self._pause_s = dict.fromkeys(self._shards, 1.0)
         self._places: dict[str, str] = {}
-        self._look_s = time.monotonic() + LOOK_S  # a worker that imports this takes seconds
+        self._look_s = time.monotonic() + LOOK_S  # by then they are placed
 
     async def keep(self) -> None:
         """Submit what does not run, until a stop is requested.
@@ -238,7 +185,7 @@ class _Placement:
         from distributed import fire_and_forget
 
         text = self._settings[self._shards[key]]
-        future = self._client.submit(run_shard, key, text, version(), key=key, resources={RESOURCE: 1})
+        future = self._client.submit(run_shard, key, ARGUMENTS, text, version(), key=key, resources={RESOURCE: 1})
         fire_and_forget(future)
         loop = asyncio.get_running_loop()
         future.add_done_callback(lambda _: loop.call_soon_threadsafe(self._changed.set))
@@ -270,7 +217,7 @@ class _Placement:
             if place == self._places.get(key, "none yet"):
                 continue
             if place:
-                log.info("running", shard=shard, worker=place)
+                log.info("placed", shard=shard, worker=place)
             else:
                 cure = f"dask worker {self._address} --nthreads 1 --no-nanny --resources {RESOURCE}=1"
                 log.warning("waiting for a worker", shard=shard, cure=cure)
