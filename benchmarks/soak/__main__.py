@@ -101,19 +101,18 @@ def table(plan: Plan, findings: Findings) -> str:
 
 def _placement_lines(placement: Placement) -> Iterator[str]:
     """Format the findings about the placement."""
-    for kind in dict.fromkeys(kind for kind, _ in placement.recoveries):
-        times = [after_s for other, after_s in placement.recoveries if other == kind]
-        text = ", ".join("never" if after_s is None else f"{after_s:.1f}" for after_s in times)
-        yield f"{kind:35s} all plants judged again after {text} s"
+    for what, items in (
+        ("all plants judged again", placement.recoveries),
+        ("monitors from before end", placement.ends),
+    ):
+        for kind in dict.fromkeys(kind for kind, _ in items):
+            times = ("never" if after_s is None else f"{after_s:.1f}" for other, after_s in items if other == kind)
+            yield f"{kind:35s} {what} after {', '.join(times)} s"
     if placement.skipped:
         yield f"cut worker                          skipped: {placement.skipped}"
-    ended_s = placement.monitors_ended_s
-    yield f"monitors outlive their scheduler    {'for ever' if ended_s is None else f'{ended_s:.1f} s'}"
-    lingered = ", ".join("for ever" if item is None else f"{item:.1f}" for item in placement.lingered_s)
-    yield f"monitors outlive a stop or cut      {lingered} s"
     shares = ", ".join(f"{name} {percent:.2f}" for name, percent in placement.cpu_percent.items())
     yield f"placement, % of a core              {sum(placement.cpu_percent.values()):.2f} ({shares})"
-    yield f"starts                              {', '.join(f'{name} {n}' for name, n in placement.starts.items())}"
+    yield f"starts                              {', '.join(f'{name}: {n}' for name, n in placement.starts.items())}"
 
 
 def main() -> int:

@@ -8,31 +8,22 @@ import os
 import re
 import signal
 import sys
-import threading
 import time
-from collections.abc import Iterable
+from collections import defaultdict
+from collections.abc import Collection
 from pathlib import Path
 
-from benchmarks.harness.machines import Network, Service, is_running, processes_of
+from benchmarks.harness.machines import Network, Service, cpu_s, is_running
 from benchmarks.soak.findings import Placement, Strike
 from benchmarks.soak.plan import Blow, Plan
-from benchmarks.soak.site import FLEET, PATIENCE_S, Site, Witness
+from benchmarks.soak.site import FLEET, PATIENCE_S, ROOT, Site, Witness
 from monitor_node.fleet import FleetConfig, shard_of
 from reactorwatch.cli.processes import write_settings
 from reactorwatch.contract.keys import parse_fleet_token
 from reactorwatch.runtime.http_pages import free_port
 
-DASK = {
-    "DASK_DISTRIBUTED__SCHEDULER__WORKER_TTL": "5s",
-    "DASK_DISTRIBUTED__WORKER__PROFILE__ENABLED": "false",
-    "DASK_DISTRIBUTED__ADMIN__TICK__INTERVAL": "2s",
-    "DASK_DISTRIBUTED__ADMIN__SYSTEM_MONITOR__INTERVAL": "10s",
-}
-"""Settings of Dask for scheduler and workers that docs/fleet.md recommends."""
-
+DASK = {"DASK_CONFIG": str(ROOT / "deploy" / "dask")}
 END_WITHIN_S = 60.0
-MONITOR = "monitor_node"
-"""What the command line of a monitor has, and no process of Dask's."""
 
 
 class Cluster(Site):
@@ -43,27 +34,26 @@ class Cluster(Site):
         super().__init__(plan, folder, zero_ns, self._network.address)
         self._address = f"tcp://{self._network.address}:{free_port()}"
         self._services: dict[str, Service] = {}
-        self._strikes: list[Strike] = []
         self._began_s = 0.0
         self._cpu_s: dict[str, float] = {}
         self._cpu_percent: dict[str, float] = {}
-        self._ends: list[float | None] = []
-        self._lingered_s: list[float | None] = []
+        self._strikes: list[Strike] = []
+        self._ends: list[tuple[str, float | None]] = []
 
     def start_monitors(self) -> None:
         """Start the cluster, and the command that places the shards on it."""
         settings = self._folder / "settings.toml"
         fleet = FleetConfig(state=str(self._folder / "states"))
         write_settings(settings, {"bus": self.bus, "monitor": self._plan.monitor, "fleet": fleet})
-        host, port = self._address.removeprefix("tcp://").split(":")
         dask = [sys.executable, "-m", "dask"]
-        self._add("scheduler", [*dask, "scheduler", "--host", host, "--port", port, "--no-dashboard"])
-        options = ["--nthreads", "1", "--no-nanny", "--no-dashboard", "--resources", "monitor=1", "--memory-limit", "0"]
+        host, port = self._address.removeprefix("tcp://").split(":")
+        self._start_service("scheduler", [*dask, "scheduler", "--host", host, "--port", port, "--no-dashboard"])
+        options = ["--nthreads", "1", "--no-nanny", "--no-dashboard", "--resources", "monitor=1"]
         for number in range(self._plan.shards + 1):
             command = [*self._network.command(number), *dask, "worker", self._address, *options]
-            self._add(f"worker {number + 1}", command)
+            self._start_service(f"worker {number + 1}", command)
         command = [sys.executable, "-m", "reactorwatch", "monitor", "--plants", FLEET, "--config", str(settings)]
-        self._add("client", [*command, "--shards", str(self._plan.shards), "--scheduler", self._address])
+        self._start_service("client", [*command, "--shards", str(self._plan.shards), "--scheduler", self._address])
 
     def begin_disturbances(self) -> None:
         """Measure the share of a core from now until the first blow."""
@@ -72,52 +62,40 @@ class Cluster(Site):
     def disturb(self, blow: Blow, witness: Witness) -> None:
         """Strike a blow, and wait until all shards are there again, and a worker to spare."""
         if not self._cpu_percent:
-            over_s = time.monotonic() - self._began_s
+            percent = 100.0 / (time.monotonic() - self._began_s)
             self._cpu_percent = {
-                name: 100.0 * (cpu_s - self._cpu_s[name]) / over_s for name, cpu_s in self._read_cpu_s().items()
+                name: percent * (taken_s - self._cpu_s[name]) for name, taken_s in self._read_cpu_s().items()
             }
         verb, name = blow.kind.split()
         if verb == "cut" and self._network.failure:
             return
-        end = blow.row + blow.rows
+        end, shard, monitors, plants = blow.row + blow.rows, blow.monitor + 1, _monitors(witness), self._plan.plants
         self.allow(end + 1)
-        monitors = _monitors(witness)
-        struck = [monitors[blow.monitor + 1]] if name == "worker" else []
-        if struck:
-            name = next(name for name, service in self._services.items() if service.group == os.getpgid(*struck))
-        service = self._services[name]
-        match verb:
-            case "kill":
-                service.kill()
-            case "stop":
-                service.signal(signal.SIGSTOP)
-            case "cut":
-                self._network.cut(int(name.split()[1]) - 1, is_cut=True)
-        plants = [
-            plant for plant in self._plan.plants if not struck or shard_of(plant, self._plan.shards) == blow.monitor + 1
-        ]
+        if name == "worker":
+            monitors = {shard: monitors[shard]}
+            plants = tuple(plant for plant in plants if shard_of(plant, self._plan.shards) == shard)
+            group = os.getpgid(monitors[shard])
+            name = next(name for name, service in self._services.items() if service.groups[-1] == group)
+        service, machine = self._services[name], list(self._services).index(name) - 1
+        begin, undo = {
+            "kill": (service.kill, service.start),
+            "stop": (lambda: service.signal(signal.SIGSTOP), lambda: service.signal(signal.SIGCONT)),
+            "cut": (lambda: self._network.set_link(machine, "down"), lambda: self._network.set_link(machine, "up")),
+        }[verb]
+        begin()
         self._strikes.append(Strike(blow.kind, self.row, time.time(), plants, name == "scheduler"))
-        if name == "scheduler":
-            threading.Thread(target=lambda: self._ends.append(_wait_for_end(monitors.values())), daemon=True).start()
         self.wait_for_row(end)
-        match verb:
-            case "kill":
-                service.start()
-            case "stop":
-                service.signal(signal.SIGCONT)
-            case "cut":
-                self._network.cut(int(name.split()[1]) - 1, is_cut=False)
-        if verb != "kill":
-            self._lingered_s.append(_wait_for_end(struck))
+        undo()
+        if blow.kind not in ("kill worker", "kill client"):  # its monitors must end by themselves
+            self._ends.append((blow.kind, _wait_for_end(monitors.values())))
         self._wait_until_whole(witness)
 
     def placement(self, witness: Witness) -> Placement:
         """Findings about the placement."""
         return Placement(
             recoveries=[(strike.kind, strike.recovery_s(witness.judged)) for strike in self._strikes],
+            ends=self._ends,
             cpu_percent=self._cpu_percent,
-            monitors_ended_s=self._ends[0] if self._ends else None,
-            lingered_s=self._lingered_s,
             superseded=witness.superseded,
             starts={name: len(service.groups) for name, service in self._services.items()},
             skipped=self._network.failure,
@@ -130,24 +108,17 @@ class Cluster(Site):
         super().__exit__(*exception)
         self._network.close()
 
-    def _add(self, name: str, command: list[str]) -> None:
+    def _start_service(self, name: str, command: list[str]) -> None:
         self._services[name] = Service(command, self._folder / f"{name.replace(' ', '')}.log", DASK)
 
-    def _start_garbage(self) -> None:
-        """There is none: what is late or lost here was lost by the placement."""
-
     def _watched_pids(self) -> dict[str, int]:
-        return {name: self._services[name].group for name in ("client", "scheduler")}
+        return {name: self._services[name].groups[-1] for name in ("client", "scheduler")}
 
     def _read_cpu_s(self) -> dict[str, float]:
-        """Time that client, scheduler and all workers have taken, without the monitors and their processes."""
-        taken = dict.fromkeys(("client", "scheduler", "workers"), 0.0)
+        """Time that client, scheduler and all workers have taken, without the monitors."""
+        taken: dict[str, float] = defaultdict(float)
         for name, service in self._services.items():
-            processes = list(processes_of(service.group))
-            monitors = {item.pid for item in processes if MONITOR in item.command}
-            taken[name if name in taken else "workers"] += sum(
-                item.cpu_s for item in processes if not monitors & {item.pid, item.parent}
-            )
+            taken[name.split()[0]] += cpu_s(service.groups[-1])
         return taken
 
     def _wait_until_whole(self, witness: Witness) -> None:
@@ -165,7 +136,7 @@ def _monitors(witness: Witness) -> dict[int, int]:
     return {int(token.number): int(re.split("[.@]", token.name)[1]) for token in tokens if token is not None}
 
 
-def _wait_for_end(pids: Iterable[int]) -> float | None:
+def _wait_for_end(pids: Collection[int]) -> float | None:
     """Wait for the end of processes; returns the time that it took, None if one did not end."""
     began_s = time.monotonic()
     while any(is_running(pid) for pid in pids):

@@ -130,8 +130,8 @@ class Placement:
 
     recoveries: list[tuple[str, float | None]]  # kind of each blow, and the seconds until all plants were judged again
     cpu_percent: dict[str, float]  # share of a core while nothing was disturbed; without the monitors themselves
-    monitors_ended_s: float | None  # from the end of the scheduler to that of the last monitor; None: one did not end
-    lingered_s: list[float | None]  # from the end of each stop or cut to that of the monitor; None: it did not end
+    ends: list[tuple[str, float | None]]  # of each stop or cut, and of the scheduler: seconds from it being over to
+    # the end of the last monitor from before; None: one did not end
     superseded: set[str]  # plants with health of a monitor after that of its successor
     starts: dict[str, int]  # number of starts of each service
     skipped: str  # reason why no worker was cut off
@@ -140,13 +140,12 @@ class Placement:
         """Yield a line for each broken promise."""
         for kind, after_s in self.recoveries:
             if after_s is None or after_s > within_s:
-                yield f"{kind}: plants judged again {f'after {after_s:.1f} s' if after_s else 'never'}"
+                yield f"{kind}: plants are judged again after {after_s} s"
         if (total := sum(self.cpu_percent.values())) > cpu_percent:
             yield f"the placement takes {total:.1f} % of a core"
-        if self.monitors_ended_s is None:
-            yield "a monitor outlives its scheduler"
-        if None in self.lingered_s:
-            yield "a monitor that was stopped or cut off outlives its successor's start"
+        for kind, after_s in self.ends:
+            if after_s is None:
+                yield f"{kind}: a monitor from before does not end"
         if self.superseded:
             yield f"{len(self.superseded)} plants have health of a monitor after that of its successor"
 

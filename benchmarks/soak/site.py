@@ -103,7 +103,9 @@ class Site:
             process = self._start(publisher, task)
             self._plants.append(process)
             self._said[f"plants {part + 1}"] = Lines(process, self._measure if part == 0 else lambda _: None)
-        self._start_garbage()
+        if not plan.shards:  # on a cluster, what is late or lost was lost by the placement
+            self._garbage = self._start(garbage, garbage.Task(plan.seed, plan.plants, self._zero_ns, self.bus))
+            self._said["garbage"] = Lines(self._garbage)
         for said in self._said.values():
             said.wait_for(lambda lines: bool(lines))
 
@@ -156,10 +158,6 @@ class Site:
         for proxy in self._proxies:
             proxy.close()
         self.router.close()
-
-    def _start_garbage(self) -> None:
-        self._garbage = self._start(garbage, garbage.Task(self._plan.seed, self._plan.plants, self._zero_ns, self.bus))
-        self._said["garbage"] = Lines(self._garbage)
 
     def _via(self, proxy: int) -> BusConfig:
         return msgspec.structs.replace(self.bus, endpoint=self._proxies[proxy].endpoint)
