@@ -92,21 +92,3 @@ class Service:
         while not self._closed.wait(1.0):
             if not self._is_down and self._process.poll() is not None:
                 self.start()
-
-
-def stat_fields(pid: int) -> list[str]:
-    """Fields of a process's `/proc/PID/stat` from its state on; that of an ended process is X."""
-    try:
-        return (Path("/proc") / str(pid) / "stat").read_text().rpartition(")")[2].split()
-    except OSError:
-        return ["X"]
-
-
-def is_running(pid: int) -> bool:
-    """True if a process has not ended."""
-    return stat_fields(pid)[0] not in "XZ"
-
-
-def cpu_s(pid: int) -> float:
-    """User and system time of a running process, without its children."""
-    return sum(map(int, stat_fields(pid)[11:13])) / os.sysconf("SC_CLK_TCK")

@@ -62,7 +62,8 @@ def soak(plan: Plan, folder: Path, *, tell: bool = False) -> Findings:
                 break
         lag_ms = witness.longest_lag_ms
         findings = assess(plan, zero_ns, witness.alarms, witness.health, lag_ms, garbage, site.memory)
-        return dataclasses.replace(findings, placement=site.placement(witness))
+        placement = site.placement(witness) if isinstance(site, Cluster) else None
+        return dataclasses.replace(findings, placement=placement)
 
 
 def _is_complete(plan: Plan, witness: Witness, plant: str) -> bool:

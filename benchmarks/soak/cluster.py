@@ -13,8 +13,8 @@ from collections import defaultdict
 from collections.abc import Collection
 from pathlib import Path
 
-from benchmarks.harness.machines import Network, Service, cpu_s, is_running
-from benchmarks.soak.findings import Placement, Strike
+from benchmarks.harness.machines import Network, Service
+from benchmarks.soak.findings import Placement, Strike, count_superseded, own_memory_mb
 from benchmarks.soak.plan import Blow, Plan
 from benchmarks.soak.site import FLEET, PATIENCE_S, ROOT, Site, Witness
 from monitor_node.fleet import FleetConfig, shard_of
@@ -96,7 +96,7 @@ class Cluster(Site):
             recoveries=[(strike.kind, strike.recovery_s(witness.judged)) for strike in self._strikes],
             ends=self._ends,
             cpu_percent=self._cpu_percent,
-            superseded=witness.superseded,
+            superseded=count_superseded(witness.judged),
             starts={name: len(service.groups) for name, service in self._services.items()},
             skipped=self._network.failure,
         )
@@ -111,14 +111,12 @@ class Cluster(Site):
     def _start_service(self, name: str, command: list[str]) -> None:
         self._services[name] = Service(command, self._folder / f"{name.replace(' ', '')}.log", DASK)
 
-    def _watched_pids(self) -> dict[str, int]:
-        return {name: self._services[name].groups[-1] for name in ("client", "scheduler")}
-
     def _read_cpu_s(self) -> dict[str, float]:
-        """Time that client, scheduler and all workers have taken, without the monitors."""
+        """User and system time of client, scheduler and all workers, without their children, the monitors."""
         taken: dict[str, float] = defaultdict(float)
         for name, service in self._services.items():
-            taken[name.split()[0]] += cpu_s(service.groups[-1])
+            fields = Path(f"/proc/{service.groups[-1]}/stat").read_text(encoding="utf-8").rpartition(")")[2].split()
+            taken[name.split()[0]] += sum(map(int, fields[11:13])) / os.sysconf("SC_CLK_TCK")
         return taken
 
     def _wait_until_whole(self, witness: Witness) -> None:
@@ -139,7 +137,7 @@ def _monitors(witness: Witness) -> dict[int, int]:
 def _wait_for_end(pids: Collection[int]) -> float | None:
     """Wait for the end of processes; returns the time that it took, None if one did not end."""
     began_s = time.monotonic()
-    while any(is_running(pid) for pid in pids):
+    while any(own_memory_mb(pid) for pid in pids):
         if time.monotonic() - began_s > END_WITHIN_S:
             return None
         time.sleep(0.1)

@@ -21,6 +21,7 @@
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from statistics import median
 from typing import NamedTuple
@@ -38,13 +39,7 @@ from recorder.tools.player import samples_of
 SIGNALS = 3
 SOON_ROWS = 20
 SILENCE = "silence/"
-UNDERWAY_ROWS = 3
-"""Rows that may have been published when a blow was struck, beside the one that was known."""
-
-RECOVERY_S = 20.0
-CPU_PERCENT = 2.0
-"""Promised: time until a shard is judged again, and share of a core that its placement takes."""
-
+UNDERWAY_ROWS = 3  # which may have been published when a blow was struck, beside the one that was known
 ROW_NS = round(PERIOD_MIN * MINUTE_NS)
 
 
@@ -124,6 +119,11 @@ class Strike(NamedTuple):
         return max(time_s - self.time_s for time_s in times if time_s is not None) if None not in times else None
 
 
+def count_superseded(judged: Mapping[str, Sequence[Judged]]) -> int:
+    """Count the plants with health of a monitor after that of its successor, which started half a second later."""
+    return sum(any(b.start_s < a.start_s - 0.5 for a, b in pairwise(items)) for items in judged.values())
+
+
 @dataclass(frozen=True)
 class Placement:
     """Findings about the placement of shards on a cluster."""
@@ -132,7 +132,7 @@ class Placement:
     cpu_percent: dict[str, float]  # share of a core while nothing was disturbed; without the monitors themselves
     ends: list[tuple[str, float | None]]  # of each stop or cut, and of the scheduler: seconds from it being over to
     # the end of the last monitor from before; None: one did not end
-    superseded: set[str]  # plants with health of a monitor after that of its successor
+    superseded: int  # number of plants with health of a monitor after that of its successor
     starts: dict[str, int]  # number of starts of each service
     skipped: str  # reason why no worker was cut off
 
@@ -147,7 +147,7 @@ class Placement:
             if after_s is None:
                 yield f"{kind}: a monitor from before does not end"
         if self.superseded:
-            yield f"{len(self.superseded)} plants have health of a monitor after that of its successor"
+            yield f"{self.superseded} plants have health of a monitor after that of its successor"
 
 
 class Change(NamedTuple):
@@ -186,7 +186,7 @@ class Findings:
     placement: Placement | None = None  # of shards on a cluster
 
     def failures(
-        self, growth_mb: float = GROWTH_MB, recovery_s: float = RECOVERY_S, cpu_percent: float = CPU_PERCENT
+        self, growth_mb: float = GROWTH_MB, recovery_s: float = 20.0, cpu_percent: float = 2.0
     ) -> Iterator[str]:
         """Yield a line for each broken promise."""
         for plant, samples in self.unaccounted.items():

@@ -16,7 +16,7 @@ import msgspec
 
 from benchmarks.harness.site import Proxy, Router, connect_client
 from benchmarks.soak import garbage, publisher
-from benchmarks.soak.findings import Judged, Placement, Taken, own_memory_mb
+from benchmarks.soak.findings import Judged, Taken, own_memory_mb
 from benchmarks.soak.plan import Blow, Plan
 from monitor_node.fleet import FleetConfig
 from monitor_node.health import NODE
@@ -31,7 +31,6 @@ ROOT = Path(__file__).parents[2]
 MONITORS = PARTS = 2
 FLEET = f"{keys.ROOT}/*"
 PATIENCE_S = 300.0
-SAME_START_S = 0.5  # two monitors of a shard never start closer together
 KEPT_S = 60.0
 """Time span of messages that each publisher keeps: longer than any blow lasts."""
 
@@ -201,25 +200,19 @@ class Site:
                 self.wait_for_row(end)
         witness.wait_for_monitors(MONITORS)
 
-    def placement(self, _witness: "Witness") -> Placement | None:
-        """Findings about the placement on a cluster; None without one."""
-        return None
-
     # --- memory ----------------------------------------------------------------------------------------------
 
     def _measure(self, line: str) -> None:
         """Record the memory of each process, at every row that the first plants publish."""
         if not line.strip().isdigit():
             return
-        numbers = {"router": self.router.pid, **self._watched_pids()}
+        numbers = {"router": self.router.pid}
+        numbers |= {f"monitor {number + 1}": process.pid for number, process in enumerate(self._monitors)}
         numbers |= {f"plants {part + 1}": process.pid for part, process in enumerate(self._plants)}
         for name, pid in numbers.items():
             taken = own_memory_mb(pid)
             if taken:
                 self.memory.setdefault(name, []).append(Taken(int(line), pid, taken))
-
-    def _watched_pids(self) -> dict[str, int]:
-        return {f"monitor {number + 1}": process.pid for number, process in enumerate(self._monitors)}
 
 
 def _tell(process: "subprocess.Popen[str]", line: str) -> None:
@@ -239,8 +232,6 @@ class Witness:
         self.longest_lag_ms = 0.0
         self.judged: dict[str, list[Judged]] = {}
         """Number of judged rows of each plant, whenever its health arrived."""
-        self.superseded: set[str] = set()
-        """Plants with health of a monitor after that of its successor."""
         self._bus = connect_client(config)
         self._bus.subscribe_liveliness(f"{keys.ROOT}/{keys.FLEET}/**", self._on_token)
         self._bus.subscribe(f"{FLEET}/{keys.ALARM}/**", self._on_message)
@@ -277,10 +268,7 @@ class Witness:
                 self.health[topic.plant] = body
                 self.longest_lag_ms = max(self.longest_lag_ms, body.lag_ms)
                 start_s = body.time_ns / 1e9 - body.uptime_s
-                before = self.judged.setdefault(topic.plant, [])
-                if before and start_s < before[-1].start_s - SAME_START_S:
-                    self.superseded.add(topic.plant)
-                before.append(Judged(time.time(), body.rows, start_s))
+                self.judged.setdefault(topic.plant, []).append(Judged(time.time(), body.rows, start_s))
             elif isinstance(body, Alarm) and body.alarm == topic.name:
                 self.alarms.setdefault(topic.plant, []).append(body)
             self._changed.notify_all()
