@@ -68,11 +68,10 @@ def parse_shard(text: str) -> Shard:
     Raises:
         InputError: the text is no shard.
     """
-    match = re.fullmatch(r"(\d{1,4})/(\d{1,4})", text)
-    shard = Shard(int(match[1]), int(match[2])) if match is not None else Shard(0, 0)
-    if not 1 <= shard.number <= shard.of <= 1000:
-        raise InputError(f"shard must be like 2/5, the second of five, with at most 1000, got {text!r}")
-    return shard
+    try:
+        return Shard(*keys.parse_shard(text))
+    except ValueError as error:
+        raise InputError(str(error)) from error
 
 
 def shard_of(plant: str, of: int) -> int:

@@ -3,6 +3,7 @@
 import logging
 import threading
 import time
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from google.protobuf.message import Message
@@ -12,7 +13,9 @@ from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, decode, encode_message
 from reactorwatch.contract.messages_pb2 import CommandReply
 from reactorwatch.errors import InputError
+from reactorwatch.runtime.acl import Role, parse_common_name
 from reactorwatch.runtime.bus_zenoh import ZenohBus, connect
+from reactorwatch.runtime.certificates import read_certificate, read_common_name
 from reactorwatch.runtime.config import BusConfig, LogConfig, MetricsConfig, read_settings, section
 from reactorwatch.runtime.event_loop import StopSignal
 from reactorwatch.runtime.node_main import configure_log
@@ -33,6 +36,29 @@ def load_recorder_settings(target: PlantOptions, level: int = logging.WARNING) -
     """Configure the log; returns the settings of the bus, and of the recorder, which name the plant."""
     tables, bus = load_settings(target, level)
     return bus, section(RecorderConfig, "recorder", tables, {"plant": target.name})
+
+
+def certificate_holder(config: BusConfig) -> tuple[str, Role] | None:
+    """Plant, which is `keys.FLEET` for all plants, and role of the bus's certificate; None without one."""
+    if config.certificate is None:
+        return None
+    return parse_common_name(read_common_name(read_certificate(Path(config.certificate))))
+
+
+def is_for_all_plants(config: BusConfig) -> bool:
+    """True if the bus's certificate is for all plants of a site."""
+    holder = certificate_holder(config)
+    return holder is not None and holder[0] == keys.FLEET
+
+
+def check_one_plant(config: BusConfig, plant: str | None) -> None:
+    """Check that a plant is named, where the certificate is for all of them.
+
+    Raises:
+        InputError: none is.
+    """
+    if plant is None and is_for_all_plants(config):
+        raise InputError("this certificate is for all plants of the site; name one by --plant")
 
 
 def observed_process(process: str | None, recorder: RecorderConfig) -> "Process | None":
@@ -65,8 +91,10 @@ def send_command(node: str, client: ClientOptions, name: str, message: Message) 
     """Send a command to a node and return its reply."""
     tables, bus_config = load_settings(client)
     timeout_s = client.timeout
+    named = client.name or tables.get(node, {}).get("plant")
+    check_one_plant(bus_config, named)
     try:
-        plant = keys.check_plant(client.name or str(tables.get(node, {}).get("plant") or keys.DEFAULT_PLANT))
+        plant = keys.check_plant(str(named or keys.DEFAULT_PLANT))
     except ValueError as error:
         raise InputError(str(error)) from error
     bus = connect_within(bus_config, "command", timeout_s)

@@ -18,10 +18,11 @@ from typing import NamedTuple
 from cryptography.exceptions import InvalidSignature
 
 from monitor_node.health import OtherMonitors
+from reactorwatch.cli.bus_client import certificate_holder, is_for_all_plants
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import DecodeError, Encoded, decode
 from reactorwatch.contract.messages_pb2 import Health
-from reactorwatch.runtime.acl import Role, kinds_of, parse_common_name
+from reactorwatch.runtime.acl import FLEET, kinds_of
 from reactorwatch.runtime.bus_zenoh import ZenohBus, connect_now
 from reactorwatch.runtime.certificates import read_certificate, read_common_name, read_key
 from reactorwatch.runtime.config import BusConfig
@@ -61,7 +62,8 @@ def run_checks(
     try:
         yield Finding("router", f"lets us in at {config.endpoint}")
         yield from _check_publishing(bus, config, plant, timeout_s)
-        yield from _check_nodes(bus, plant, timeout_s)
+        is_one = plant != FLEET or not is_for_all_plants(config)
+        yield from _check_nodes(bus, plant, timeout_s) if is_one else _check_all_nodes(bus, timeout_s)
     finally:
         bus.close()
 
@@ -104,8 +106,8 @@ def _check_certificate(config: BusConfig, plant: str, now: datetime) -> Iterator
         yield Finding("identity", f"{config.key} is not the key of {config.certificate}", "copy its whole folder again")
     if stat.S_IMODE(key_file.stat().st_mode) & 0o077:
         yield Finding("private key", f"{key_file} can be read by others", f"chmod 600 {key_file}")
-    holder = parse_common_name(name)
-    if holder is None or holder[0] != plant:
+    holder = certificate_holder(config)
+    if holder is None or holder[0] not in (plant, keys.FLEET):
         cure = f"use a certificate of {plant}, or name its plant by --plant"
         yield Finding("identity", f"{name or 'a certificate without a name'}: has no role of plant {plant}", cure)
 
@@ -121,8 +123,8 @@ def _check_disk(folder: Path, room_mb: float) -> Finding:
 
 
 def _check_publishing(bus: ZenohBus, config: BusConfig, plant: str, timeout_s: float) -> Iterator[Finding]:
-    role = _role(config)
-    kinds = (keys.SAMPLE,) if role is None else kinds_of(role)
+    holder = certificate_holder(config)
+    kinds = (keys.SAMPLE,) if holder is None else kinds_of(holder[1])
     if not kinds:
         yield Finding("heard", "this certificate is for reading and queries; it publishes nothing")
         return
@@ -149,15 +151,8 @@ def _is_received(speaker: ZenohBus, listener: ZenohBus, plant: str, kind: str, t
     return heard.is_set()
 
 
-def _role(config: BusConfig) -> Role | None:
-    if config.certificate is None:
-        return None
-    holder = parse_common_name(read_common_name(read_certificate(Path(config.certificate))))
-    return holder[1] if holder is not None else None
-
-
 class _NodeListener:
-    """Subscriber to the nodes' tokens and health, with the offset of each clock from this machine's in seconds.
+    """Subscriber to tokens and health of nodes of a plant, or of all with `*`, and the offsets of their clocks in s.
 
     Cached messages may be a minute old, so only live ones count. A delayed message makes a clock seem behind, so the
     largest offset is the best estimate. A clock behind by no more than a message's delay is observed further, until a
@@ -165,11 +160,11 @@ class _NodeListener:
     """
 
     def __init__(self, bus: ZenohBus, plant: str, timeout_s: float) -> None:
-        self._timeout_s = timeout_s
-        self.alive: set[str] = set()
-        self.health: dict[str, tuple[Health, float]] = {}
+        self._plant, self.timeout_s = plant, timeout_s
+        self.alive: set[tuple[str, str]] = set()  # by plant and node
+        self.health: dict[tuple[str, str], tuple[Health, float]] = {}
         self.monitors = OtherMonitors("", lambda: ())
-        self._done: set[str] = set()
+        self._done: set[tuple[str, str]] = set()
         self._changed = threading.Condition()
         bus.subscribe_liveliness(keys.all_keys(plant, keys.ALIVE), self._on_token)
         for tokens in (keys.monitor_token(plant, "*"), keys.FLEET_TOKENS):
@@ -178,14 +173,15 @@ class _NodeListener:
 
     def wait(self) -> None:
         """Wait until all expected nodes have published their health, and their offsets are known."""
+        expected = {(self._plant, node) for node in NODES}  # no node is of a plant `*`
         with self._changed:
-            self._changed.wait_for(lambda: set(NODES) <= self._done & self.alive, self._timeout_s)
+            self._changed.wait_for(lambda: expected <= self._done & self.alive, self.timeout_s)
 
     def _on_token(self, key: str, is_alive: bool) -> None:
         topic = keys.parse(key)
         if topic is not None:
             with self._changed:
-                (self.alive.add if is_alive else self.alive.discard)(topic.name)
+                (self.alive.add if is_alive else self.alive.discard)((topic.plant, topic.name))
                 self._changed.notify_all()
 
     def _on_monitor(self, token: str, is_alive: bool) -> None:
@@ -199,22 +195,42 @@ class _NodeListener:
         except DecodeError:
             return
         if topic is not None and isinstance(health, Health):
+            node = topic.plant, topic.name
             with self._changed:
                 offset_s = (health.time_ns - message.received_ns) / 1e9
-                before = self.health.get(topic.name)
+                before = self.health.get(node)
                 if before is not None:
                     offset_s = max(offset_s, before[1])
-                if offset_s >= -MAX_OFFSET_S or (before is not None and offset_s < -self._timeout_s):
-                    self._done.add(topic.name)
-                self.health[topic.name] = health, offset_s
+                if offset_s >= -MAX_OFFSET_S or (before is not None and offset_s < -self.timeout_s):
+                    self._done.add(node)
+                self.health[node] = health, offset_s
                 self._changed.notify_all()
 
 
 def _check_nodes(bus: ZenohBus, plant: str, timeout_s: float) -> Iterator[Finding]:
     listener = _NodeListener(bus, plant, timeout_s)
     listener.wait()
-    alive, reports = set(listener.alive), dict(listener.health)
-    expected = [node for node in NODES if node != "plant" or "replay" not in alive]
+    alive = {node for of, node in listener.alive if of == plant}
+    yield from _check_plant(listener, plant, [node for node in NODES if node != "plant" or "replay" not in alive])
+
+
+def _check_all_nodes(bus: ZenohBus, timeout_s: float) -> Iterator[Finding]:
+    """Check the nodes of all plants. Each plant has a monitor; the recorder for all is that of the plant `FLEET`."""
+    listener = _NodeListener(bus, "*", timeout_s)
+    listener.wait()
+    plants = {plant for plant, _ in (*listener.alive, *listener.health)}
+    for plant in sorted(plants):
+        for finding in _check_plant(listener, plant, [] if plant == FLEET else ["monitor"]):
+            if finding.cure:
+                yield finding._replace(check=f"{finding.check} of {plant}")
+    cure = "" if plants else "start them, or listen for longer by --timeout"
+    yield Finding("plants", f"{len(plants - {FLEET})} with nodes", cure)
+
+
+def _check_plant(listener: _NodeListener, plant: str, expected: list[str]) -> Iterator[Finding]:
+    reports = {node: report for (of, node), report in listener.health.items() if of == plant}
+    # a fleet's monitor shows the tokens of some of its plants only
+    alive = reports.keys() | {node for of, node in listener.alive if of == plant}
     for node in (*expected, *sorted(alive - set(expected))):
         if node not in alive:
             cure = f"start it, and call doctor with the settings of {node} if it is running"
@@ -224,7 +240,7 @@ def _check_nodes(bus: ZenohBus, plant: str, timeout_s: float) -> Iterator[Findin
                 yield Finding(node, "is alive")  # a replay and the diagnosis node publish no health
             else:
                 cure = "call doctor with its settings; or listen for longer than its health_period_s by --timeout"
-                yield Finding(node, f"is alive, and publishes no health within {timeout_s:g} s", cure)
+                yield Finding(node, f"is alive, and publishes no health within {listener.timeout_s:g} s", cure)
         else:
             yield _check_node(node, *reports[node])
     if (monitors := listener.monitors.count(plant)) > 1:

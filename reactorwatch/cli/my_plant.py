@@ -241,7 +241,9 @@ def place_shards(
 
 def status(
     *,
-    nodes: Annotated[list[str] | None, Argument(help="With --check: these nodes [all that publish health].")] = None,
+    nodes: Annotated[
+        list[str] | None, Argument(help="With --check: these nodes, or shards such as 2/5 [all that publish health].")
+    ] = None,
     target: ClientOptions,
     chosen: ProcessOption,
     check: Annotated[
@@ -252,7 +254,7 @@ def status(
     as_json: Json = False,
 ) -> None:
     """Show the current state of plants, nodes, rates and alarms, until stopped; or check that nodes are alive."""
-    from reactorwatch.cli.bus_client import load_recorder_settings, observed_process
+    from reactorwatch.cli.bus_client import is_for_all_plants, load_recorder_settings, observed_process
     from reactorwatch.cli.status import check_alive, run
 
     bus, recorder = load_recorder_settings(target)
@@ -261,9 +263,9 @@ def status(
     if nodes:
         raise InputError(f"{nodes[0]}: nodes are named for --check alone; give it, or leave them out")
     described = observed_process(chosen.process, recorder)
-    # a certificate is for one plant, and messages of others are not received
-    plant = recorder.plant if target.name is not None or bus.ca is not None else None
-    run(bus, plant, seconds, described, once=once, as_json=as_json)
+    # with a certificate for one plant, messages of others are not received
+    is_one = target.name is not None or (bus.ca is not None and not is_for_all_plants(bus))
+    run(bus, recorder.plant if is_one else None, seconds, described, once=once, as_json=as_json)
 
 
 LOOPBACK = "127.0.0.1"
@@ -291,12 +293,13 @@ def view(
     import logging
     from dataclasses import replace
 
-    from reactorwatch.cli.bus_client import load_recorder_settings, observed_process
+    from reactorwatch.cli.bus_client import check_one_plant, load_recorder_settings, observed_process
     from reactorwatch.description.read import find_process
     from recorder.view.viewer import DisplayTarget, show
 
     if chosen.process is not None and target.config is None:
         target = replace(target, name=target.name or find_process(chosen.process).name)
     bus, recorder = load_recorder_settings(target, logging.INFO)
+    check_one_plant(bus, target.name)
     described = observed_process(chosen.process, recorder)
     show(recorder.plant, bus, DisplayTarget(web=web, bind=bind, port=port), print_lines, described)

@@ -22,7 +22,9 @@ class DoctorOptions(PlantOptions):
 
 def certify(
     folder: Annotated[Path, Argument(help="Of the site: new, or one to add to.")],
-    plant: Annotated[list[str] | None, Option(help="A plant to add [those there, or cstr]. Repeatable.")] = None,
+    plant: Annotated[
+        list[str] | None, Option(help="A plant to add, or '*': members for all [those there, or cstr]. Repeatable.")
+    ] = None,
     endpoint: Annotated[
         str | None, Option(help="Address at which nodes connect to the router [as before, or tls/127.0.0.1:7447].")
     ] = None,
@@ -36,8 +38,8 @@ def certify(
     revoke: Annotated[
         list[str] | None,
         Option(
-            help="Make the router refuse the present certificates of this plant and role, such as cstr/monitor, and "
-            "make a new one. Repeatable."
+            help="Make the router refuse the present certificates of this plant and role, such as cstr/monitor or "
+            "fleet/monitor, and make a new one. Repeatable."
         ),
     ] = None,
 ) -> None:

@@ -223,38 +223,46 @@ def run(
 
 
 def check_alive(config: BusConfig, plant: str, nodes: Sequence[str], timeout_s: float, *, as_json: bool) -> int:
-    """Wait until nodes of a plant are alive, by their liveliness tokens, and print which are.
+    """Wait until nodes of a plant or shards of a fleet are alive, by their liveliness tokens, and print which are.
 
     Args:
         config: settings of the bus.
         plant: name of the plant.
-        nodes: names of the nodes; empty: all that publish health, at least one.
+        nodes: names of the nodes, or shards such as `2/5`, which are alive when a monitor of that shard of any fleet
+            is; empty: all nodes that publish health, at least one.
         timeout_s: longest wait, in seconds.
         as_json: True to print one JSON object.
 
     Returns:
         0 if they are alive, else 1.
+
+    Raises:
+        InputError: a shard is malformed.
     """
-    alive: set[str] = set()
+    try:
+        nodes = ["{}/{}".format(*keys.parse_shard(node)) if "/" in node else node for node in nodes]
+    except ValueError as error:
+        raise InputError(str(error)) from error
+    alive: set[str] = set()  # tokens: two fleets may have monitors of a shard
     healthy: set[str] = set()
     changed = threading.Condition()
     until_s = time.monotonic() + timeout_s
 
     def are_alive() -> bool:
-        wanted = set(nodes) or healthy
-        return bool(wanted) and wanted <= alive
+        wanted = set(nodes) or set(map(_node_name, healthy))
+        return bool(wanted) and wanted <= set(map(_node_name, alive))
 
-    def update(names: set[str], key: str, is_there: bool) -> None:
-        topic = keys.parse(key)
-        if topic is not None:
-            with changed:
-                (names.add if is_there else names.discard)(topic.name)
-                changed.notify_all()
+    def update(known: set[str], key: str, is_there: bool) -> None:
+        with changed:
+            (known.add if is_there else known.discard)(key)
+            changed.notify_all()
 
     bus = connect_within(config, "status", timeout_s)
     if bus is not None:
         try:
-            bus.subscribe_liveliness(keys.all_keys(plant, keys.ALIVE), partial(update, alive))
+            tokens = keys.all_keys(plant, keys.ALIVE)
+            for expression in {keys.FLEET_TOKENS if "/" in node else tokens for node in nodes} or {tokens}:
+                bus.subscribe_liveliness(expression, partial(update, alive))
             if not nodes:
                 health = keys.all_keys(plant, keys.HEALTH)
                 bus.subscribe(health, lambda message: update(healthy, message.key, True), history_s=HISTORY_S)
@@ -263,7 +271,8 @@ def check_alive(config: BusConfig, plant: str, nodes: Sequence[str], timeout_s: 
         finally:
             bus.close()
     with changed:
-        found = {node: node in alive for node in nodes or sorted(healthy)}
+        names = set(map(_node_name, alive))
+        found = {node: node in names for node in nodes or sorted(map(_node_name, healthy))}
     if as_json:
         states = [{"node": node, "alive": is_alive} for node, is_alive in found.items()]
         print_screen_text(json_line({"plant": plant, "nodes": states}))
@@ -273,6 +282,14 @@ def check_alive(config: BusConfig, plant: str, nodes: Sequence[str], timeout_s: 
         if not found:
             print_lines(f"no node of plant {plant!r} published its health within {timeout_s:g} s")
     return 0 if found and all(found.values()) else 1
+
+
+def _node_name(key: str) -> str:
+    """Name of a node, by the key of its token or its health; of a fleet's monitor its shard, such as `2/5`."""
+    token, topic = keys.parse_fleet_token(key), keys.parse(key)
+    if token is not None:
+        return f"{token.number}/{token.of}"
+    return key if topic is None else topic.name
 
 
 def _subscribe(bus: ZenohBus, plant: str, process: "Process | None") -> StatusBoard:

@@ -48,6 +48,8 @@ _PLANT = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
 
 _SIGNAL = re.compile(r"[^@*$#?/\0][^*$#?/\0]*")
 
+_SHARD = re.compile(r"([0-9]{1,4})/([0-9]{1,4})")
+
 _PART = re.compile(r"\*\*?|(\$\*)?[^/*$#?\0]+(\$\*[^/*$#?\0]+)*(\$\*)?")
 
 
@@ -203,6 +205,22 @@ def parse_fleet_token(token: str) -> FleetToken | None:
         return FleetToken(check_plants(f"{ROOT}/{parts[0].replace('+', '*')}"), *parts[1:])
     except ValueError:
         return None
+
+
+def parse_shard(text: str) -> tuple[int, int]:
+    """Number and count of a shard in its text form.
+
+    >>> parse_shard("2/5")
+    (2, 5)
+
+    Raises:
+        ValueError: the text is no shard.
+    """
+    match = _SHARD.fullmatch(text)
+    number, of = (int(match[1]), int(match[2])) if match is not None else (0, 0)
+    if not 1 <= number <= of <= 1000:
+        raise ValueError(f"shard must be like 2/5, the second of five, with at most 1000, got {text!r}")
+    return number, of
 
 
 def samples_of(plants: str) -> str:

@@ -1,7 +1,7 @@
 """Access control: roles, and the rules that a router enforces for them.
 
-Each client has a certificate whose common name holds plant and role: `cstr.monitor`. A message that no rule allows is
-refused silently (`reactorwatch doctor` finds refusals).
+Each client has a certificate whose common name holds plant and role: `cstr.monitor`; that of a client for all plants of
+a site is `@fleet.monitor`. A message that no rule allows is refused silently (`reactorwatch doctor` finds refusals).
 
 A router checks each message at ingress and at egress. Publishing is allowed at ingress; reading is allowed at both: a
 subscription wider than the rule is refused, and no message of another plant goes out. Publishers' caches are queried
@@ -26,6 +26,9 @@ CACHE_SUFFIX = "@adv/**"
 """Part below a key at which Zenoh's publishers answer queries of their caches."""
 NO_QUERYABLE = f"{keys.ROOT}watch/nobody"
 """Key without a queryable: a query of it ends when all messages before it have arrived. Every role may query it."""
+
+FLEET = keys.FLEET.removeprefix("@")
+"""Stands in place of a plant for all plants of a site."""
 
 PLANT_COMMANDS = ("set_input", "inject_fault", "clear_fault")
 """Commands of the plant."""
@@ -112,10 +115,15 @@ READ_EGRESS = ("put", "delete", "reply", "liveliness_token", "declare_queryable"
 def common_name(plant: str, role: str) -> str:
     """Common name of a holder's certificate.
 
-    >>> common_name("cstr", "viewer")
-    'cstr.viewer'
+    >>> common_name("cstr", "viewer"), common_name(FLEET, "viewer")
+    ('cstr.viewer', '@fleet.viewer')
     """
-    return f"{plant}.{role}"
+    return f"{keys.FLEET if plant == FLEET else plant}.{role}"
+
+
+def roles_of(plant: str) -> tuple[Role, ...]:
+    """Roles with certificates for a plant, or for all: none publishes samples in the name of every plant."""
+    return tuple(role for role in ROLES if plant != FLEET or role.name != "plant")
 
 
 def kinds_of(role: Role) -> tuple[str, ...]:
@@ -145,16 +153,27 @@ def access_control(
     Only one role publishes on a key (see `streams`): where a role's expression also matches keys of another, a rule
     denies them, which takes precedence.
 
+    A publisher sends nothing before it knows of a subscriber, and no rule of a plant matches a subscription or a query
+    to all plants. So where clients for all plants exist, these reach the clients of each plant.
+
     Args:
-        plants: names of the plants.
+        plants: names of the plants; `FLEET`: clients for all plants.
         names: common names of holders' certificates, by `plant/role`, where they differ from `common_name`.
         revoked: common names of certificates without any rights, listed in the settings under `subjects`.
     """
-    rules: list[dict[str, Any]] = [_rule("everyone", "end of history", ("ingress",), ("query",), [NO_QUERYABLE])]
+    common = [_rule("everyone", "end of history", ("ingress",), ("query",), [NO_QUERYABLE])]
+    if FLEET in plants:
+        all_plants = [f"{keys.ROOT}/*/**", f"{keys.ROOT}/*/**/{CACHE_SUFFIX}"]
+        common += [
+            _rule("everyone", "see subscribers to all plants", ("egress",), ("declare_subscriber",), all_plants),
+            _rule("everyone", "receive their queries", ("egress",), ("query",), all_plants[1:]),
+        ]
+    rules: list[dict[str, Any]] = [*common]
     subjects, policies = [], []
     for plant in plants:
-        root = f"{keys.ROOT}/{plant}"
-        instances = {node: keys.instance_token(plant, node, "*") for role in ROLES for node in role.nodes}
+        pattern = "*" if plant == FLEET else plant
+        root = f"{keys.ROOT}/{pattern}"
+        instances = {node: keys.instance_token(pattern, node, "*") for role in ROLES for node in role.nodes}
         others = [f"{root}/*/{PROOF}", *instances.values(), keys.FLEET_TOKENS]
         everything = [f"{root}/**", f"{root}/**/{CACHE_SUFFIX}", *others]
         reading = [
@@ -163,7 +182,7 @@ def access_control(
             _rule(plant, "query caches", ("ingress",), ("query",), everything[1:2]),
         ]
         rules += reading
-        for role in ROLES:
+        for role in roles_of(plant):
             name = common_name(plant, role.name)
             asks = [f"{root}/{keys.COMMAND}/{command}" for command in role.asks]
             own = [_rule(name, "command", ("ingress",), ("query",), asks)]
@@ -174,6 +193,7 @@ def access_control(
                 answers = [f"{root}/{keys.COMMAND}/{command}" for command in role.answers]
                 alive = [f"{root}/{keys.ALIVE}/{node}" for node in role.nodes]
                 alive += [instances[node] for node in role.nodes]
+                alive += [keys.FLEET_TOKENS] if plant == FLEET and role.name == "monitor" else []
                 own += [
                     _rule(name, "publish", ("ingress",), ("put", "reply"), [*published, *caches, *proofs]),
                     _rule(name, "cache", ("ingress",), ("declare_queryable", "liveliness_token"), caches),
@@ -196,7 +216,7 @@ def access_control(
                     )
             rules += own
             subjects.append({"id": name, "cert_common_names": [names.get(f"{plant}/{role.name}", name)]})
-            used = [rules[0], *reading, *own]
+            used = [*common, *reading, *own]
             policies.append({"rules": [rule["id"] for rule in used], "subjects": [name]})
     if revoked:
         nothing = _rule(REVOKED, "nothing", ("ingress", "egress"), EVERY_MESSAGE, ["**", f"**/{CACHE_SUFFIX}"])

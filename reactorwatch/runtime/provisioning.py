@@ -5,6 +5,7 @@ SITE/authority/             the authority's private key, which signs new certifi
 SITE/router/                certificate, key, the authority's certificate, and router.json5, Zenoh's settings
 SITE/cstr/monitor/          certificate, key, the authority's certificate, and settings.toml for --config
 SITE/cstr/viewer/ ...
+SITE/fleet/monitor/ ...     the same for clients for all plants, where there are any
 """
 
 import datetime
@@ -26,7 +27,7 @@ from reactorwatch.errors import InputError
 from reactorwatch.limits import parse_json
 from reactorwatch.records.decode import read_regular
 from reactorwatch.records.write import atomic_write
-from reactorwatch.runtime.acl import ROLES, SERIAL_BYTES, access_control, common_name
+from reactorwatch.runtime.acl import FLEET, ROLES, SERIAL_BYTES, access_control, common_name, roles_of
 from reactorwatch.runtime.certificates import (
     Identity,
     issue,
@@ -42,6 +43,8 @@ CA, CERTIFICATE, KEY = "ca.pem", "certificate.pem", "key.pem"
 ROUTER_SETTINGS, SETTINGS = "router.json5", "settings.toml"
 REGISTER_FILE = "site.json"
 FILES = (CA, CERTIFICATE, KEY, ROUTER_SETTINGS, SETTINGS, REGISTER_FILE)
+ALL = "*"
+"""Names all plants in place of a plant."""
 DEFAULT_ENDPOINT = "tls/127.0.0.1:7447"
 
 MAX_PLANT_NAME = 64 - max(len(common_name("", role.name)) for role in ROLES) - 2 * SERIAL_BYTES - 1
@@ -106,14 +109,14 @@ def make_site(
     renew_days: float | None = None,
     revoke: Sequence[str] = (),
 ) -> list[Path]:
-    """Make the missing parts of a site: its authority, the router, and every role of every plant.
+    """Make the missing parts of a site: its authority, the router, and every role of every plant or of all plants.
 
     Complete folders stay unchanged, except for the router's settings, which allow the plants of the site. A folder with
     a missing or damaged file is completed. A plant is removed by deleting its folder.
 
     Args:
         folder: the site's folder; made if it does not exist.
-        plants: names of plants to add. A new site without any gets `cstr`.
+        plants: names of plants to add; `*` adds the roles for all plants. A new site without any gets `cstr`.
         endpoint: address at which nodes connect to the router, `tls/HOST:PORT`; the router's certificate is for that
             host. None: as before, or this machine's loopback.
         listen: address at which the router listens, of the same form. None: as before, or `endpoint`.
@@ -131,10 +134,10 @@ def make_site(
     """
     _check(plants, days)
     there = _find_plants(folder)
-    plants = tuple(sorted({*there, *plants}))
+    plants = tuple(sorted({*there, *(FLEET if plant == ALL else plant for plant in plants)}))
     if not plants and not (folder / AUTHORITY).is_dir():
         plants = (keys.DEFAULT_PLANT,)
-    holders = [f"{plant}/{role.name}" for plant in plants for role in ROLES]
+    holders = _list_holders(plants)
     for holder in revoke:
         if holder not in holders:
             raise InputError(
@@ -165,13 +168,20 @@ def make_site(
     return made
 
 
+def _list_holders(plants: Sequence[str]) -> list[str]:
+    """Holders of certificates, which are paths of their folders in a site: `cstr/monitor`, `fleet/monitor`."""
+    return [f"{plant}/{role.name}" for plant in plants for role in roles_of(plant)]
+
+
 def _check(plants: tuple[str, ...], days: float) -> None:
     for plant in plants:
+        if plant == ALL:
+            continue
         try:
             keys.check_plant(plant)
         except ValueError as error:
             raise InputError(f"--plant: {error}") from error
-        if plant in (AUTHORITY, ROUTER):
+        if plant in (AUTHORITY, ROUTER, FLEET):
             raise InputError(f"--plant {plant}: is the name of another folder of the site; choose another")
         if len(plant) > MAX_PLANT_NAME:
             raise InputError(
@@ -195,11 +205,15 @@ def _check_paths(folder: Path, holders: list[str]) -> None:
 
 
 def _find_plants(folder: Path) -> list[str]:
-    """Names of the plants with a folder in a site."""
+    """Names of the plants with a folder in a site; `FLEET`: there are folders for all plants."""
     plants = []
     for holder in sorted(folder.glob("*/*")):
         plant = holder.parent.name
         if holder.is_dir() and holder.name in {role.name for role in ROLES} and plant not in (AUTHORITY, ROUTER):
+            if plant == FLEET and holder.name not in {role.name for role in roles_of(plant)}:
+                raise InputError(
+                    f"{holder}: {FLEET} is the folder for all plants of the site; name this plant otherwise"
+                )
             try:
                 plants.append(keys.check_plant(plant))
             except ValueError as error:
@@ -209,8 +223,7 @@ def _find_plants(folder: Path) -> list[str]:
 
 def _has_certificates(folder: Path, there: list[str]) -> bool:
     """True if a site has certificates, and so an authority that exists somewhere."""
-    holders = [folder / ROUTER, *(folder / plant / role.name for plant in there for role in ROLES)]
-    return any((holder / CERTIFICATE).exists() for holder in holders)
+    return any((folder / holder / CERTIFICATE).exists() for holder in (ROUTER, *_list_holders(there)))
 
 
 def _update_register(folder: Path, there: list[str], endpoint: str | None, listen: str | None) -> Register:
@@ -334,14 +347,18 @@ def _router_settings(rules: dict[str, Any], listen: str) -> str:
 
 
 def _settings(plant: str, endpoint: str) -> str:
-    """Settings for `--config`: the router's address, the files of the identity, and the plant."""
-    tables = {
-        "bus": {"endpoint": endpoint, "ca": CA, "certificate": CERTIFICATE, "key": KEY},
+    """Settings for `--config`: the router's address, the files of the identity, and the plant or plants."""
+    plants = f"{keys.ROOT}/{'*' if plant == FLEET else plant}"
+    named: dict[str, dict[str, str]] = {
         "plant": {"name": plant},
         "monitor": {"plant": plant},
         "replay": {"plant": plant},
+    }
+    tables = {
+        "bus": {"endpoint": endpoint, "ca": CA, "certificate": CERTIFICATE, "key": KEY},
+        **({"fleet": {"plants": plants}} if plant == FLEET else named),
         # a subscription wider than the rights would be refused as a whole
-        "recorder": {"plant": plant, "key_expression": f"{keys.ROOT}/{plant}/**"},
+        "recorder": {"plant": plant, "key_expression": f"{plants}/**"},
     }
     return tomli_w.dumps(tables)
 

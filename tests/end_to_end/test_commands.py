@@ -228,6 +228,33 @@ def test_a_node_that_is_not_there_is_not_alive(bus: ZenohBus, endpoint: str, cal
     assert json.loads(gone.stdout) == {"plant": "cstr", "nodes": [{"node": "monitor", "alive": False}]}
 
 
+def test_a_shard_is_alive_as_long_as_a_monitor_of_it_in_any_fleet_is(
+    bus: ZenohBus, endpoint: str, called: Command
+) -> None:
+    def check(*nodes: str) -> tuple[int, list[list[str | bool]]]:
+        done = called("status", "--check", *nodes, "--endpoint", endpoint, "--timeout", "1", "--json")
+        return done.returncode, [list(node.values()) for node in json.loads(done.stdout)["nodes"]]
+
+    north, all_plants = (keys.fleet_token(plants, "5", "2", "a.1@pi4") for plants in ("reactor/north_*", "reactor/*"))
+    for token in (north, all_plants, keys.key("cstr", keys.ALIVE, "recorder")):
+        bus.declare_token(token)
+    assert check("2/5") == (0, [["2/5", True]])
+    assert check("2/5", "recorder") == (0, [["2/5", True], ["recorder", True]])
+    assert check("3/5", "02/05", "2/6") == (1, [["3/5", False], ["2/5", True], ["2/6", False]])
+    bus.undeclare_token(north)
+    assert check("2/5") == (0, [["2/5", True]])
+    bus.undeclare_token(all_plants)
+    assert check("2/5") == (1, [["2/5", False]])
+
+
+@pytest.mark.parametrize("shard", ["6/5", "0/5", "2/", "a/b", "1/1001", "²/5"])
+def test_a_malformed_shard_is_refused_in_one_line(shard: str, called: Command) -> None:
+    done = called("status", "--check", shard)
+    assert done.returncode == 2
+    assert f"shard must be like 2/5, the second of five, with at most 1000, got {shard!r}\n" in done.stderr
+    assert done.stderr.count("\n") == 1
+
+
 def test_simulate_and_backtest_speak_json_to_machines(called: Command, record_csv: Path, tmp_path: Path) -> None:
     simulated = called("simulate", record_csv, "-o", tmp_path / "out.csv", "--json")
     assert simulated.returncode == 0, simulated.stderr

@@ -32,6 +32,7 @@ JOINS_THE_BUS = (
 SCREEN = "needs a screen"
 ROOT_ONLY = "is for root and a running systemd, tests/integration/test_systemd.py checks the units"
 ENGINE = "needs an engine for containers"
+CLUSTER = "needs a cluster"
 REGISTRY = "needs a registry of images"
 INDEX = "needs a package index"
 OTHERS = "is for several machines, tests/unit/runtime/test_jobs.py has a cluster on loopback"
@@ -42,6 +43,16 @@ NOT_HERE = {
         ("COMMIT=$(git rev-parse HEAD) docker compose build", ENGINE),
         ("docker buildx imagetools inspect --format '{{.Manifest.Digest}}' python:3.13.9-slim-trixie", REGISTRY),
         ("docker buildx imagetools inspect --format '{{.Manifest.Digest}}' eclipse/zenoh:1.10.2", REGISTRY),
+        ("kubectl apply -k deploy/kubernetes", CLUSTER),
+        ("kubectl get pods --selector app.kubernetes.io/part-of=reactorwatch", CLUSTER),
+        (
+            "reactorwatch certify SITE --plant '*' --endpoint tls/router:7447 --listen tls/0.0.0.0:7447",
+            CLUSTER,
+        ),
+        ("kubectl create secret generic router --from-file=SITE/router", CLUSTER),
+        ("kubectl create secret generic monitor --from-file=SITE/fleet/monitor", CLUSTER),
+        ("kubectl create secret generic recorder --from-file=SITE/fleet/recorder", CLUSTER),
+        ("kubectl apply -k deploy/kubernetes/secure", CLUSTER),
         ("cp deploy/systemd/*.service /etc/systemd/system/", ROOT_ONLY),
         (
             "systemd-run --wait --uid=reactorwatch -p CacheDirectory=reactorwatch"
@@ -50,6 +61,9 @@ NOT_HERE = {
             ROOT_ONLY,
         ),
         ("systemctl enable --now reactorwatch-router reactorwatch@monitor reactorwatch@record", ROOT_ONLY),
+        ("cp deploy/systemd/reactorwatch@.service /etc/systemd/system/reactorwatch-shard@.service", ROOT_ONLY),
+        ("cp -r deploy/systemd/reactorwatch-shard@.service.d /etc/systemd/system/", ROOT_ONLY),
+        ("systemctl enable --now reactorwatch-shard@1 reactorwatch-shard@2", ROOT_ONLY),
         ("pip install 'reactorwatch[metrics]'", INDEX),
     ],
     "docs/getting-started.md": [(".venv/bin/rerun runs/demo-…/demo.rrd", SCREEN)],

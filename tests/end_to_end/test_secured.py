@@ -1,5 +1,6 @@
 """`up` and `demo` on a site: its router with its rules, each node with the certificate of its role."""
 
+import json
 import subprocess
 import threading
 import tomllib
@@ -91,6 +92,50 @@ def test_up_admits_clients_with_a_certificate_and_no_others(site: Path, tmp_path
     assert {"sample", "health"} <= kinds
     (written,) = (tmp_path / "runs").glob("*.plant.toml")
     assert tomllib.loads(written.read_text())["recorder"]["key_expression"] == "reactor/cstr/**"
+
+
+@pytest.mark.slow
+def test_a_monitor_for_all_plants_watches_two_that_have_certificates_of_their_own(
+    site: Path, tmp_path: Path, start: Start, command: Command
+) -> None:
+    make_site(site, ("*",), None, None, 90.0, datetime.now(UTC))
+    start("router", site / "router" / "router.json5")
+    for plant in ("cstr", "demo"):
+        start("plant", "--config", site / plant / "plant" / "settings.toml", "--speed", "60")
+    start("monitor", "--config", site / "fleet" / "monitor" / "settings.toml")
+    start("record", "--config", site / "fleet" / "recorder" / "settings.toml", "--out", tmp_path / "runs")
+    viewer = connect(bus_of(site / "fleet" / "viewer" / "settings.toml"), "viewer", StopSignal())
+    assert viewer is not None
+    watched, both = set[str](), threading.Event()
+
+    def listen(message: Encoded) -> None:
+        health = decode(message.payload, message.encoding)
+        assert isinstance(health, Health)
+        if health.received > 100:
+            watched.add(message.key.split("/")[1])
+        if watched >= {"cstr", "demo"}:
+            both.set()
+
+    viewer.subscribe("reactor/*/health/monitor", listen)
+    assert both.wait(PATIENCE_S), watched
+    viewer.close()
+    shown = {}
+    for member in ("fleet/viewer", "cstr/viewer"):
+        done = command("status", "--json", "--config", site / member / "settings.toml", cwd=tmp_path)
+        shown[member] = {item["plant"]: item for item in json.loads(done.stdout)["plants"]}
+    assert shown["fleet/viewer"].keys() == {"cstr", "demo", "fleet"}
+    assert shown["cstr/viewer"].keys() == {"cstr"}
+    for plant in ("cstr", "demo"):
+        alive = {node["node"]: node["alive"] for node in shown["fleet/viewer"][plant]["nodes"]}
+        assert alive == {"plant": True, "monitor": True}
+    doctor = command("doctor", "--config", site / "fleet" / "monitor" / "settings.toml", cwd=tmp_path)
+    assert doctor.returncode == 0, doctor.stdout
+    assert "ok     plants: 2 with nodes" in doctor.stdout
+    for asked in ("alarm list", "view"):
+        unnamed = command(*asked.split(), "--config", site / "fleet" / "viewer" / "settings.toml", cwd=tmp_path)
+        assert (unnamed.returncode, unnamed.stderr.count("name one by --plant")) == (2, 1)
+    alarms = command("alarm", "list", "--plant", "demo", "--config", site / "fleet" / "viewer" / "settings.toml")
+    assert alarms.returncode == 0, alarms.stderr
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,7 @@
 
 import subprocess
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,12 @@ from ..end_to_end.conftest import PATIENCE_S, REACTORWATCH
 ROOT = Path(__file__).parents[2]
 PLAIN = ROOT / "docker-compose.yml"
 SECURE = ROOT / "deploy" / "docker-compose.secure.yml"
+FLEET = ROOT / "deploy" / "docker-compose.fleet.yml"
 NODES = ("recorder", "monitor", "plant")
+SHARDS = 5
+"""Number of monitors of a fleet, which are `monitor-1` to `monitor-5` everywhere."""
+WATCHED = keys.key("cstr", keys.HEALTH, "monitor")
+"""Sign that the monitor of a fleet watches the plant: it publishes no estimates."""
 
 Services = dict[str, Any]
 
@@ -28,27 +33,41 @@ def services_of(file: Path) -> Services:
     return declared
 
 
-def run_nodes(services: Services, bus: ZenohBus, outside: Callable[[str], Mapping[str, str]]) -> None:
-    """Run the nodes until the monitor has said something, each once the one before is healthy, and end them.
+def plant_beside(*bus: str) -> dict[str, Any]:
+    """A plant as a service, for a fleet that has none of its own, with its options of the bus."""
+    check = ["CMD", "reactorwatch", "status", "--check", "plant", *bus]
+    return {"command": ["plant", *bus, "--speed", "1"], "healthcheck": {"test": check}}
+
+
+def run_nodes(
+    services: Services,
+    bus: ZenohBus,
+    outside: Callable[[str], Mapping[str, str]],
+    nodes: Sequence[str] = NODES,
+    sign: str = keys.all_keys("cstr", keys.ESTIMATE),
+) -> None:
+    """Run nodes until the monitor has published something, each once the one before is healthy, and end them.
 
     Args:
         services: of the file.
         bus: that the nodes come to.
         outside: of each node, what the words of its commands that only a container knows are outside of it.
+        nodes: names of the services that are run; the last one is the plant `cstr`.
+        sign: key expression of the messages of which the monitor must publish one.
     """
-    estimated = threading.Event()
+    published = threading.Event()
 
-    def on_estimate(_message: Encoded) -> None:
-        estimated.set()
+    def on_message(_message: Encoded) -> None:
+        published.set()
 
     def natively(node: str, words: list[str]) -> list[str]:
         replaced = outside(node)
         return [REACTORWATCH, *(replaced.get(word, word) for word in words)]
 
-    bus.subscribe(keys.all_keys("cstr", keys.ESTIMATE), on_estimate)
+    bus.subscribe(sign, on_message)
     running = []
     try:
-        for node in NODES:
+        for node in nodes:
             words = services[node]["command"]
             if node == "plant":  # a second of its clock is a second of ours in the container; not here
                 words = [*words[:-1], "600"]
@@ -57,7 +76,7 @@ def run_nodes(services: Services, bus: ZenohBus, outside: Callable[[str], Mappin
             assert check[:2] == ["CMD", "reactorwatch"]
             health = natively(node, [*check[2:], "--timeout", f"{PATIENCE_S:g}"])
             assert subprocess.run(health, check=False, capture_output=True).returncode == 0, node
-        assert estimated.wait(PATIENCE_S)
+        assert published.wait(PATIENCE_S)
         for process in reversed(running):
             process.terminate()
             assert process.wait(PATIENCE_S) == 0

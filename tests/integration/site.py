@@ -48,11 +48,12 @@ class Site:
 
     Args:
         folder: for the site's files.
+        plants: the plants of the site.
     """
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, plants: tuple[str, ...] = PLANTS) -> None:
         self.folder = folder
-        self.endpoint = make(folder)
+        self.endpoint = make(folder, plants=plants)
         self.router = router_from_file(folder / "router" / "router.json5")
         self._joined: list[ZenohBus] = []
         self._received: list[Encoded] = []

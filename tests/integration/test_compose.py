@@ -9,13 +9,17 @@ from pathlib import Path
 import pytest
 import yaml
 
+from monitor_node.fleet import shard_of
 from reactorwatch.runtime.bus_zenoh import router
 from reactorwatch.runtime.config import BusConfig
 from reactorwatch.runtime.http_pages import free_endpoint
 
-from .compose import NODES, PLAIN, SECURE, run_nodes, services_of
+from .compose import FLEET, NODES, PLAIN, SECURE, SHARDS, WATCHED, plant_beside, run_nodes, services_of
 
-both = pytest.mark.parametrize("file", [PLAIN, SECURE], ids=lambda file: file.name)
+MONITORS = [f"monitor-{number}" for number in range(1, SHARDS + 1)]
+SERVICES = {PLAIN: {"router", *NODES}, SECURE: {"router", *NODES}, FLEET: {"router", "recorder", *MONITORS}}
+
+every_file = pytest.mark.parametrize("file", SERVICES, ids=lambda file: file.name)
 
 
 def test_every_service_s_command_and_health_check_work(tmp_path: Path) -> None:
@@ -27,33 +31,55 @@ def test_every_service_s_command_and_health_check_work(tmp_path: Path) -> None:
     assert (tmp_path / "monitor.state").is_file()
 
 
-@both
+def test_the_commands_and_health_checks_of_a_fleet_s_services_work(tmp_path: Path) -> None:
+    endpoint = free_endpoint()
+    outside = {"tcp/router:7447": endpoint, "/recordings": str(tmp_path), "/state": str(tmp_path)}
+    services = {**services_of(FLEET), "plant": plant_beside("--endpoint", endpoint)}
+    nodes = ("recorder", f"monitor-{shard_of('cstr', SHARDS)}", "plant")
+    with closing(router(BusConfig(endpoint=endpoint))) as bus:
+        run_nodes(services, bus, lambda _node: outside, nodes, WATCHED)
+    assert len(list(tmp_path.glob("fleet-*.mcap"))) == 1
+    assert (tmp_path / "cstr.state").is_file()
+
+
+@every_file
 def test_every_service_is_watched_and_comes_back(file: Path) -> None:
     services = services_of(file)
-    assert set(services) == {"router", *NODES}
+    assert set(services) == SERVICES[file]
     for name, service in services.items():
         assert service["restart"] == "unless-stopped", name
         assert service["healthcheck"]["test"], name
 
 
-@pytest.mark.parametrize("node", ["recorder", "monitor"])
-def test_the_recordings_and_what_was_learned_outlive_the_containers(node: str) -> None:
-    service = services_of(PLAIN)[node]
-    (mount,) = [mount for mount in service["volumes"] if not mount.startswith("cache:")]
-    volume, target = mount.split(":")
-    assert volume in yaml.safe_load(PLAIN.read_text(encoding="utf-8"))["volumes"]
-    assert target in service["command"]
-    assert f" {target}" in (PLAIN.parent / "Dockerfile").read_text(encoding="utf-8"), "it would belong to root"
+@pytest.mark.parametrize("file", [PLAIN, FLEET], ids=lambda file: file.name)
+def test_the_recordings_and_what_was_learned_outlive_the_containers(file: Path) -> None:
+    volumes = []
+    for node in SERVICES[file] - {"router", "plant"}:
+        service = services_of(file)[node]
+        (mount,) = [mount for mount in service["volumes"] if not mount.startswith("cache:")]
+        volume, target = mount.split(":")
+        volumes.append(volume)
+        assert volume in yaml.safe_load(file.read_text(encoding="utf-8"))["volumes"]
+        assert target in service["command"]
+        assert f" {target}" in (PLAIN.parent / "Dockerfile").read_text(encoding="utf-8"), "it would belong to root"
+    assert len(set(volumes)) == len(volumes), "two services would write to one"
 
 
-@both
+def test_each_monitor_of_a_fleet_has_a_shard_and_is_checked_for_it() -> None:
+    for number, name in enumerate(MONITORS, start=1):
+        service = services_of(FLEET)[name]
+        command, check = service["command"], service["healthcheck"]["test"]
+        assert command[command.index("--shard") + 1] == check[check.index("--check") + 1] == f"{number}/{SHARDS}"
+
+
+@every_file
 def test_the_router_is_open_on_loopback_only(file: Path) -> None:
     for service in services_of(file).values():
         for port in service.get("ports", []):
             assert port.startswith("127.0.0.1:")
 
 
-@both
+@every_file
 def test_docker_compose_accepts_the_file(file: Path) -> None:
     program = shutil.which("docker-compose")
     if program is None:
@@ -61,7 +87,7 @@ def test_docker_compose_accepts_the_file(file: Path) -> None:
     subprocess.run([program, "-f", str(file), "config", "-q"], check=True)
 
 
-@both
+@every_file
 def test_every_service_is_locked_down_and_limited(file: Path) -> None:
     for name, service in services_of(file).items():
         assert service["read_only"] is True, name
@@ -73,7 +99,7 @@ def test_every_service_is_locked_down_and_limited(file: Path) -> None:
         assert not service.get("privileged"), name
 
 
-@both
+@every_file
 def test_what_a_service_writes_is_on_a_volume(file: Path) -> None:
     """The root is read-only."""
     for name, service in services_of(file).items():
@@ -84,7 +110,7 @@ def test_what_a_service_writes_is_on_a_volume(file: Path) -> None:
         assert {*written, *compiled} <= set(mounted), name
 
 
-@both
+@every_file
 def test_images_have_versions(file: Path) -> None:
     for name, service in services_of(file).items():
         assert re.search(r":\d+\.\d+\.\d+(\.dev\d+)?(@sha256:[0-9a-f]{64})?$", service["image"]), name

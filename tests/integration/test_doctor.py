@@ -9,7 +9,7 @@ import subprocess
 import threading
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 
 import msgspec
@@ -237,6 +237,19 @@ def test_two_monitors_of_one_plant_are_reported(site: Site, tmp_path: Path) -> N
         found = wrong(settings(site.folder, "cstr/viewer"), tmp_path)
     assert set(found) == {"monitors"}
     assert found["monitors"].found == "2 of them watch cstr: every alarm is raised as often"
+
+
+def test_with_a_certificate_for_all_plants_the_nodes_of_each_are_checked(tmp_path: Path) -> None:
+    with closing(Site(tmp_path / "site", ("cstr", "other", "*"))) as site:
+        watched = {node: site.join("fleet/" + node) for node in ("monitor", "recorder")}
+        with nodes({"plant": site.join("cstr/plant"), **watched}):
+            for role in ("monitor", "recorder", "viewer"):
+                config = settings(site.folder, f"fleet/{role}")
+                assert wrong(config, tmp_path) == {}
+                assert wrong(config, tmp_path, A_WHILE_S, plant="fleet") == {}
+            other = site.join("other/plant")
+            other.declare_token(keys.key("other", keys.ALIVE, "plant"))
+            assert "monitor of other" in wrong(config, tmp_path, A_WHILE_S, plant="fleet")
 
 
 def test_a_full_disk_is_reported(tmp_path: Path) -> None:

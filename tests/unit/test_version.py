@@ -18,6 +18,7 @@ import yaml
 import reactorwatch
 from reactorwatch.cli.main import main
 from reactorwatch.version import COMMIT, UNKNOWN, describe_build, find_commit, this_build, version
+from tests.manifests import pod, workloads
 
 ROOT = Path(__file__).parents[2]
 PYPROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
@@ -40,9 +41,12 @@ def test_the_number_is_repeated_in_no_module() -> None:
     assert [str(path) for path in modules if NUMBER in path.read_text(encoding="utf-8")] == []
 
 
-def test_the_citation_and_the_images_of_the_compose_files_have_the_version() -> None:
+def test_the_citation_and_the_images_of_containers_and_pods_have_the_version() -> None:
     assert yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))["version"] == NUMBER
-    for file in (ROOT / "docker-compose.yml", ROOT / "deploy" / "docker-compose.secure.yml"):
+    for item in workloads(ROOT / "deploy" / "kubernetes").values():
+        images = {one["image"] for one in (*pod(item).get("initContainers", []), *pod(item)["containers"])}
+        assert images in ({f"reactorwatch:{NUMBER}"}, {"eclipse/zenoh:1.10.2"}), item["metadata"]["name"]
+    for file in (ROOT / "docker-compose.yml", *(ROOT / "deploy").glob("docker-compose.*.yml")):
         services = yaml.safe_load(file.read_text(encoding="utf-8"))["services"]
         own = {item["image"] for name, item in services.items() if name != "router"}
         assert own == {f"reactorwatch:{NUMBER}"}, file.name

@@ -45,11 +45,11 @@ PUBLISHERS = [role.name for role in ROLES if role.nodes]
 
 @cache
 def publishers(key: str) -> frozenset[str]:
-    """The roles that the router lets publish on a key, by its rules."""
-    rules = access_control(("cstr",))["rules"]
+    """The roles that the router lets publish on a key, by its rules, with certificates for the plant or for all."""
+    rules = access_control(("cstr", "fleet"))["rules"]
     found = set()
-    for name in PUBLISHERS:
-        own = [rule for rule in rules if rule["id"].startswith(f"cstr.{name}:") and "put" in rule["messages"]]
+    for name, plant in itertools.product(PUBLISHERS, ("cstr", "@fleet")):
+        own = [rule for rule in rules if rule["id"].startswith(f"{plant}.{name}:") and "put" in rule["messages"]]
         permissions = {rule["permission"] for rule in own if any(matches(each, key) for each in rule["key_exprs"])}
         if permissions == {"allow"}:
             found.add(name)

@@ -145,19 +145,21 @@ def test_what_is_no_site_leaves_nothing_behind(
 
 
 def test_nothing_is_allowed_by_default_and_every_rule_is_used() -> None:
-    access = access_control(("a", "b"))
+    access = access_control(("a", "b", "fleet"))
     assert access["default_permission"] == "deny"
     used = {rule for policy in access["policies"] for rule in policy["rules"]}
     assert used == {rule["id"] for rule in access["rules"]}
 
 
-def test_no_rule_of_a_plant_reaches_another_but_for_the_tokens_of_fleets() -> None:
-    access = access_control(("a", "b"))
-    rules = {rule["id"]: rule["key_exprs"] for rule in access["rules"]}
+def test_no_rule_of_a_plant_reaches_another_but_for_tokens_of_fleets_and_what_readers_of_all_plants_ask() -> None:
+    access = access_control(("a", "b", "fleet"))
+    of_all = [rule for rule in access["rules"] if rule["id"].startswith("everyone") and "egress" in rule["flows"]]
+    assert {message for rule in of_all for message in rule["messages"]} == {"declare_subscriber", "query"}
+    rules = {rule["id"]: rule["key_exprs"] for rule in access["rules"] if rule not in of_all}
     for policy in access["policies"]:
-        plant = policy["subjects"][0].split(".")[0]
-        reached = {key.split("/")[1] for rule in policy["rules"] for key in rules[rule] if key != keys.FLEET_TOKENS}
-        assert reached == {plant, "nobody"}
+        plant = policy["subjects"][0].split(".")[0].replace("@fleet", "*")
+        allowed = [key for rule in policy["rules"] for key in rules.get(rule, ()) if key != keys.FLEET_TOKENS]
+        assert {key.split("/")[1] for key in allowed} == {plant, "nobody"}
 
 
 @pytest.mark.parametrize(

@@ -141,7 +141,7 @@ def test_the_last_plant_that_is_removed_stays_removed(site: Path) -> None:
     ("plants", "endpoint", "listen"),
     [
         *((("a" * length,), ENDPOINT, None) for length in (MAX_PLANT_NAME + 1, 64, 65)),
-        *(((name,), ENDPOINT, None) for name in ("ü", "a/b", "", "a b", "a\n", '"', "authority", "..")),
+        *(((name,), ENDPOINT, None) for name in ("ü", "a/b", "", "a b", "a\n", '"', "authority", "fleet", "**", "..")),
         *((("a",), address, None) for address in ("tls/ü:7447", 'tls/a":7447', "tls/a b:1", "tls/a:0", "tls/a:65536")),
         *((("a",), address, None) for address in ("tls/a\n:1", "tls/[::1:1", "tls/:1", "tls//:1", "tls/a:x", "x")),
         (("a",), ENDPOINT, "tls/'\"':7447"),
@@ -217,6 +217,31 @@ def test_what_is_no_holder_cannot_be_revoked(site: Path, holder: str) -> None:
     before = contents(site)
     with pytest.raises(InputError, match="is no PLANT/ROLE of this site"):
         make_site(site, (), None, None, 90.0, NOW, revoke=[holder])
+    assert contents(site) == before
+
+
+def test_members_for_all_plants_are_kept_and_revoked_like_those_of_a_plant(site: Path) -> None:
+    members = [site / "fleet" / role.name for role in ROLES if role.name != "plant"]
+    assert make_site(site, ("*",), None, None, 90.0, NOW) == members
+    before = contents(site)
+    assert make_site(site, (), None, None, 90.0, NOW) == []
+    assert contents(site) == before
+    assert rules(site)["access_control"] == access_control(("a", "fleet"))
+    names = {read_common_name(read_certificate(member / "certificate.pem")) for member in members}
+    assert names == {f"@fleet.{member.name}" for member in members}
+    tables = read_settings(site / "fleet" / "monitor" / "settings.toml")
+    assert tables["fleet"]["plants"] == "reactor/*"
+    assert tables["recorder"]["key_expression"] == "reactor/*/**"
+    assert make_site(site, (), None, None, 90.0, NOW, revoke=["fleet/monitor"]) == [site / "fleet" / "monitor"]
+    revoked = next(item for item in rules(site)["access_control"]["subjects"] if item["id"] == "revoked")  # type: ignore[index]
+    assert revoked["cert_common_names"] == ["@fleet.monitor"]
+
+
+def test_a_plant_that_an_older_version_called_fleet_is_refused_in_one_line(site: Path) -> None:
+    (site / "a").rename(site / "fleet")
+    before = contents(site)
+    with pytest.raises(InputError, match=r"fleet/plant: .* name this plant otherwise"):
+        make_site(site, (), None, None, 90.0, NOW)
     assert contents(site) == before
 
 
