@@ -51,12 +51,15 @@ def certify(
     """
     from datetime import UTC, datetime
 
-    from reactorwatch.runtime.provisioning import AUTHORITY, ROUTER, ROUTER_SETTINGS, make_site
+    from reactorwatch.runtime.provisioning import AUTHORITY, CLUSTER, ROUTER, ROUTER_SETTINGS, make_site
 
+    notes = {
+        AUTHORITY: "; signs new certificates, keep it off line",
+        CLUSTER: "; holders run code on the workers; restart scheduler and workers together, with this certificate",
+    }
     now, revoked = datetime.now(UTC), tuple(revoke or ())
     for made in make_site(folder, tuple(plant or ()), endpoint, listen, days, now, renew_days=renew, revoke=revoked):
-        note = "; signs new certificates, keep it off line" if made.name == AUTHORITY else ""
-        print_lines(f"{made}{note}")
+        print_lines(f"{made}{notes.get(made.name, '')}")
     for holder in revoke or ():
         print_lines(
             f"{folder / ROUTER / ROUTER_SETTINGS}: refuses earlier certificates of {holder}; restart the router"

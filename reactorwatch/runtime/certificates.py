@@ -1,7 +1,8 @@
 """Certificates of a site: its own authority, and one certificate for each client of its bus.
 
-Keys are P-256, signatures ECDSA with SHA-256, names as in RFC 5280. Only the router's certificate is one of a server:
-the extended key usage of the others is that of a client, so that a stolen viewer's certificate makes no false router.
+Keys are P-256, signatures ECDSA with SHA-256, names as in RFC 5280. Of the bus, only the router's certificate is one of
+a server: the extended key usage of the others is that of a client, so that a stolen viewer's certificate makes no false
+router.
 """
 
 import datetime
@@ -55,7 +56,15 @@ def make_authority(name: str, now: datetime.datetime, days: float) -> Identity:
     return Identity(builder.sign(key, hashes.SHA256()), key)
 
 
-def issue(by: Identity, name: str, now: datetime.datetime, days: float, hosts: tuple[str, ...] = ()) -> Identity:
+def issue(
+    by: Identity,
+    name: str,
+    now: datetime.datetime,
+    days: float,
+    hosts: tuple[str, ...] = (),
+    *,
+    is_peer: bool = False,
+) -> Identity:
     """Issue a certificate signed by an authority.
 
     Args:
@@ -64,16 +73,18 @@ def issue(by: Identity, name: str, now: datetime.datetime, days: float, hosts: t
         now: time from which it is valid.
         days: days for which it is valid; cut at the end of the authority's certificate.
         hosts: host names and addresses of a router; empty for a client.
+        is_peer: True for a program that is both server and client.
     """
     key = ec.generate_private_key(ec.SECP256R1())
-    usage = ExtendedKeyUsageOID.SERVER_AUTH if hosts else ExtendedKeyUsageOID.CLIENT_AUTH
+    server, client = ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH
+    usages = [server, client] if is_peer else [server if hosts else client]
     days = min(days, (by.certificate.not_valid_after_utc - now) / datetime.timedelta(days=1))
     signer_key = x509.AuthorityKeyIdentifier.from_issuer_public_key(by.key.public_key())
     builder = (
         _builder(name, by.certificate.subject, key.public_key(), now, days)
         .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
         .add_extension(_usage(signs_certificates=False), critical=True)
-        .add_extension(x509.ExtendedKeyUsage([usage]), critical=False)
+        .add_extension(x509.ExtendedKeyUsage(usages), critical=False)
         .add_extension(signer_key, critical=False)
     )
     if hosts:

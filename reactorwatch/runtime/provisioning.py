@@ -6,6 +6,7 @@ SITE/router/                certificate, key, the authority's certificate, and r
 SITE/cstr/monitor/          certificate, key, the authority's certificate, and settings.toml for --config
 SITE/cstr/viewer/ ...
 SITE/fleet/monitor/ ...     the same for clients for all plants, where there are any
+SITE/fleet/cluster/         certificate, key and authority of the Dask cluster of a fleet, and Dask's settings with them
 """
 
 import datetime
@@ -19,6 +20,7 @@ from typing import Any
 
 import msgspec
 import tomli_w
+from cryptography import x509
 from cryptography.exceptions import InvalidSignature
 from cryptography.hazmat.primitives import serialization
 
@@ -42,7 +44,8 @@ AUTHORITY, ROUTER = "authority", "router"
 CA, CERTIFICATE, KEY = "ca.pem", "certificate.pem", "key.pem"
 ROUTER_SETTINGS, SETTINGS = "router.json5", "settings.toml"
 REGISTER_FILE = "site.json"
-FILES = (CA, CERTIFICATE, KEY, ROUTER_SETTINGS, SETTINGS, REGISTER_FILE)
+CLUSTER, CLUSTER_SETTINGS = "cluster", "cluster.yaml"
+FILES = (CA, CERTIFICATE, KEY, ROUTER_SETTINGS, SETTINGS, REGISTER_FILE, CLUSTER_SETTINGS)
 ALL = "*"
 """Names all plants in place of a plant."""
 DEFAULT_ENDPOINT = "tls/127.0.0.1:7447"
@@ -143,7 +146,8 @@ def make_site(
             raise InputError(
                 f"--revoke {holder}: is no PLANT/ROLE of this site (valid: {', '.join(holders) or 'none'})"
             )
-    _check_paths(folder, holders)
+    cluster = f"{FLEET}/{CLUSTER}"
+    _check_paths(folder, [*holders, cluster])
     register = _update_register(folder, there, endpoint, listen)
     try:
         ca, made = _load_authority(folder / AUTHORITY, now, is_old=_has_certificates(folder, there))
@@ -160,9 +164,11 @@ def make_site(
         with atomic_write(folder / ROUTER / ROUTER_SETTINGS) as part:
             part.write_text(_router_settings(rules, register.listen), encoding="utf-8")
         for holder in holders:
-            settings = _settings(holder.partition("/")[0], register.endpoint)
+            settings = _settings(holder, register.endpoint)
             if issuer.complete(folder / holder, register.name_of(holder), settings=settings):
                 made.append(folder / holder)
+        if FLEET in plants and _complete_cluster(folder / cluster, now, days, until):
+            made.append(folder / cluster)
     except OSError as error:
         raise InputError(f"{folder}: cannot be written: {error.strerror}") from error
     return made
@@ -271,7 +277,7 @@ class _Issuer:
 
     def complete(self, folder: Path, name: str, hosts: tuple[str, ...] = (), settings: str = "") -> bool:
         """Make the missing, damaged and outdated files of a folder; returns False if there are none."""
-        is_new = not self._is_valid(folder, name)
+        is_new = not _is_valid(folder, name, self._ca.certificate, self._until)
         if not is_new and (folder / CA).is_file() and (not settings or (folder / SETTINGS).is_file()):
             return False
 
@@ -285,14 +291,58 @@ class _Issuer:
         _install(folder, write)
         return True
 
-    def _is_valid(self, folder: Path, name: str) -> bool:
-        try:
-            certificate, key = read_certificate(folder / CERTIFICATE), read_key(folder / KEY)
-            certificate.verify_directly_issued_by(self._ca.certificate)
-        except (InputError, ValueError, TypeError, InvalidSignature):
-            return False
-        is_pair = key.public_key() == certificate.public_key()
-        return is_pair and read_common_name(certificate) == name and certificate.not_valid_after_utc > self._until
+
+def _is_valid(folder: Path, name: str, ca: x509.Certificate, until: datetime.datetime) -> bool:
+    try:
+        certificate, key = read_certificate(folder / CERTIFICATE), read_key(folder / KEY)
+        certificate.verify_directly_issued_by(ca)
+    except (InputError, ValueError, TypeError, InvalidSignature):
+        return False
+    is_pair = key.public_key() == certificate.public_key()
+    return is_pair and read_common_name(certificate) == name and certificate.not_valid_after_utc > until
+
+
+def _complete_cluster(folder: Path, now: datetime.datetime, days: float, until: datetime.datetime) -> bool:
+    """Make or renew the identity of a fleet's Dask cluster; returns False if it is complete.
+
+    A program with a certificate of the cluster's authority runs code on its workers. So the authority is not that of
+    the site, whose certificates every viewer has: it signs this one certificate, and its key is not kept.
+    """
+    try:
+        is_new = not _is_valid(folder, CLUSTER, read_certificate(folder / CA), until)
+    except InputError:
+        is_new = True
+    settings = folder / CLUSTER_SETTINGS
+    if not is_new and settings.is_file() and settings.read_bytes() == _cluster_settings(folder):
+        return False
+
+    def write(new: Path) -> None:
+        if is_new:
+            ca = make_authority(f"reactorwatch cluster {now:%Y-%m-%d}", now, days)
+            issue(ca, CLUSTER, now, days, is_peer=True).write(new / CERTIFICATE, new / KEY)
+            (new / CA).write_bytes(ca.certificate.public_bytes(serialization.Encoding.PEM))
+        (new / CLUSTER_SETTINGS).touch(mode=0o600)
+        (new / CLUSTER_SETTINGS).write_bytes(_cluster_settings(new if is_new else folder))
+
+    _install(folder, write)
+    return True
+
+
+def _cluster_settings(folder: Path) -> bytes:
+    """Settings of Dask's scheduler and workers, which read the YAML files of the folder `DASK_CONFIG`.
+
+    They hold the certificates themselves, as a path would be relative to the folder in which Dask is started.
+    """
+    ca, certificate, key = ((folder / name).read_text(encoding="ascii") for name in (CA, CERTIFICATE, KEY))
+    identity = {"cert": certificate, "key": key}
+    tls = {"ca-file": ca, "scheduler": identity, "worker": identity, "client": identity}
+    settings = {
+        "comm": {"require-encryption": True, "tls": tls},
+        # a lost worker is noticed within seconds, and a shard, which is never the reason for it, is never given up
+        "scheduler": {"worker-ttl": "2s", "allowed-failures": 1_000_000, "http": {"routes": []}},
+        "worker": {"http": {"routes": []}},  # pages have neither encryption nor a password
+    }
+    return json.dumps({"distributed": settings}, indent=2).encode() + b"\n"
 
 
 def _make_private(folder: Path) -> None:
@@ -346,17 +396,19 @@ def _router_settings(rules: dict[str, Any], listen: str) -> str:
     return json.dumps(settings, indent=2) + "\n"
 
 
-def _settings(plant: str, endpoint: str) -> str:
+def _settings(holder: str, endpoint: str) -> str:
     """Settings for `--config`: the router's address, the files of the identity, and the plant or plants."""
+    plant, _, role = holder.partition("/")
     plants = f"{keys.ROOT}/{'*' if plant == FLEET else plant}"
     named: dict[str, dict[str, str]] = {
         "plant": {"name": plant},
         "monitor": {"plant": plant},
         "replay": {"plant": plant},
     }
+    of_monitor = {"fleet": {"plants": plants, "identity": f"../{CLUSTER}"}}
     tables = {
         "bus": {"endpoint": endpoint, "ca": CA, "certificate": CERTIFICATE, "key": KEY},
-        **({"fleet": {"plants": plants}} if plant == FLEET else named),
+        **(named if plant != FLEET else of_monitor if role == "monitor" else {}),
         # a subscription wider than the rights would be refused as a whole
         "recorder": {"plant": plant, "key_expression": f"{plants}/**"},
     }

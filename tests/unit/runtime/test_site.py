@@ -3,11 +3,14 @@
 import datetime
 import json
 import shutil
+import stat
 import tomllib
 from pathlib import Path
 
 import pytest
 from cryptography import x509
+from cryptography.exceptions import InvalidSignature
+from cryptography.x509.oid import ExtendedKeyUsageOID
 from cryptography.x509.verification import PolicyBuilder, Store
 
 from reactorwatch.errors import InputError
@@ -18,6 +21,7 @@ from reactorwatch.runtime.provisioning import MAX_PLANT_NAME, make_site
 
 NOW = datetime.datetime(2026, 1, 1, tzinfo=datetime.UTC)
 DAY = datetime.timedelta(days=1)
+PEM = ("ca.pem", "certificate.pem", "key.pem")
 ENDPOINT, LISTEN = "tls/bus.example:7447", "tls/0.0.0.0:7447"
 
 
@@ -222,7 +226,7 @@ def test_what_is_no_holder_cannot_be_revoked(site: Path, holder: str) -> None:
 
 def test_members_for_all_plants_are_kept_and_revoked_like_those_of_a_plant(site: Path) -> None:
     members = [site / "fleet" / role.name for role in ROLES if role.name != "plant"]
-    assert make_site(site, ("*",), None, None, 90.0, NOW) == members
+    assert make_site(site, ("*",), None, None, 90.0, NOW) == [*members, site / "fleet" / "cluster"]
     before = contents(site)
     assert make_site(site, (), None, None, 90.0, NOW) == []
     assert contents(site) == before
@@ -231,10 +235,48 @@ def test_members_for_all_plants_are_kept_and_revoked_like_those_of_a_plant(site:
     assert names == {f"@fleet.{member.name}" for member in members}
     tables = read_settings(site / "fleet" / "monitor" / "settings.toml")
     assert tables["fleet"]["plants"] == "reactor/*"
+    assert Path(tables["fleet"]["identity"]).samefile(site / "fleet" / "cluster")
     assert tables["recorder"]["key_expression"] == "reactor/*/**"
     assert make_site(site, (), None, None, 90.0, NOW, revoke=["fleet/monitor"]) == [site / "fleet" / "monitor"]
     revoked = next(item for item in rules(site)["access_control"]["subjects"] if item["id"] == "revoked")  # type: ignore[index]
     assert revoked["cert_common_names"] == ["@fleet.monitor"]
+
+
+def test_a_cluster_has_an_authority_of_its_own_that_signs_nothing_else(site: Path) -> None:
+    make_site(site, ("*",), None, None, 90.0, NOW)
+    cluster = site / "fleet" / "cluster"
+    ca, certificate = read_certificate(cluster / "ca.pem"), read_certificate(cluster / "certificate.pem")
+    certificate.verify_directly_issued_by(ca)
+    assert read_key(cluster / "key.pem").public_key() == certificate.public_key() != ca.public_key()
+    assert ca.public_key() not in [read_key(path).public_key() for path in site.rglob("key.pem")]  # it was not kept
+    for member in site.glob("*/*/certificate.pem"):
+        if member.parent != cluster:
+            with pytest.raises((ValueError, InvalidSignature)):
+                read_certificate(member).verify_directly_issued_by(ca)
+    usage = certificate.extensions.get_extension_for_class(x509.ExtendedKeyUsage).value
+    assert set(usage) == {ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH}
+    for name in ("key.pem", "cluster.yaml"):
+        assert stat.S_IMODE((cluster / name).stat().st_mode) == 0o600
+
+
+def test_the_identity_of_a_cluster_is_renewed_as_a_whole_and_completed_when_damaged(site: Path) -> None:
+    make_site(site, ("*",), None, None, 90.0, NOW)
+    cluster, later = site / "fleet" / "cluster", NOW + 70 * DAY
+    before = contents(cluster)
+    assert make_site(site, (), None, None, 365.0, later) == []
+    (cluster / "cluster.yaml").write_bytes(b"")
+    assert make_site(site, (), None, None, 365.0, later) == [cluster]
+    assert contents(cluster) == before
+    for missing in ("", "key.pem", "ca.pem"):
+        if missing:
+            (cluster / missing).unlink()
+        assert cluster in make_site(site, (), None, None, 365.0, later, renew_days=30.0)
+        renewed = contents(cluster)
+        assert not set(renewed.values()) & set(before.values())
+        assert all(json.dumps(renewed[name].decode()).encode() in renewed["cluster.yaml"] for name in PEM)
+        before = renewed
+    certificate = read_certificate(cluster / "certificate.pem")
+    assert certificate.not_valid_after_utc == later + 365 * DAY
 
 
 def test_a_plant_that_an_older_version_called_fleet_is_refused_in_one_line(site: Path) -> None:
