@@ -64,8 +64,9 @@ cuts: $(READY) ## cut links and kill routers under load for up to 30 seconds, an
 fuzz: $(READY) ## 200,000 random messages, commands, states and settings: no failure, no alarm; two minutes
 	@$(BIN)/python benchmarks/fuzz.py
 
-soak: $(READY) ## a fleet for ten minutes of kills, cuts and garbage (MINUTES=10 PLANTS=200 SEED=): what is missing or repeated
+soak: $(READY) ## a fleet for ten minutes of kills, cuts and garbage, and ten on a cluster (MINUTES=10 PLANTS=200 SEED=): what is missing or repeated
 	@$(BIN)/python -m benchmarks.soak $(or $(MINUTES),10) $(or $(PLANTS),200) $(SEED)
+	@$(BIN)/python -m benchmarks.soak $(or $(MINUTES),10) $(or $(PLANTS),200) $(SEED) --cluster
 
 promise: $(READY) ## false alarms beside the number promised, with equations and without; delays, statements: 20 minutes (RESULTS= continues)
 	@$(BIN)/python -m benchmarks.promise $(if $(RESULTS),--results $(RESULTS))

@@ -1,7 +1,8 @@
 """Fleet: a dictionary of monitors, one for each plant, its settings, and its division into shards.
 
-A plant is watched from the first liveliness token of one of its nodes, or from its first sample, if it is in this
-monitor's shard. Its publications are the same, value for value, as if it were monitored alone.
+A plant is watched from the first liveliness token of one of its nodes but the recorder, which may record all plants, or
+from its first sample, if it is in this monitor's shard. Its publications are the same, value for value, as if it were
+monitored alone.
 
 Each monitor of a divided fleet has one shard: `2/5` is the second of five. A plant's shard follows from a digest of its
 name, the same on every machine and in every version, and never changes.
@@ -215,9 +216,9 @@ def prepare(kinds: Sequence[PlantKind], *, points: bool) -> None:
 class FleetMonitor(Node):
     """Monitors of many plants.
 
-    A plant is verified by a liveliness token of one of its nodes, by a stored state, or by aligned rows. Anyone may
-    publish under invented names, so the number of unverified plants is limited, and those that fall silent are evicted:
-    invented names use up neither memory nor the capacity for plants with a token.
+    A plant is verified by a liveliness token of one of its nodes but the recorder, by a stored state, or by aligned
+    rows. Anyone may publish under invented names, so the number of unverified plants is limited, and those that fall
+    silent are evicted: invented names use up neither memory nor the capacity for plants with a token.
 
     Args:
         kinds: kinds of plants, see `load_kinds`. A plant is of the first kind that names it, else of the first whose
@@ -356,9 +357,9 @@ class FleetMonitor(Node):
     # --- event loop ------------------------------------------------------------------------------------------
 
     def on_alive(self, token: str, is_alive: bool, now_ns: int) -> list[Publication]:
-        """Process the liveliness token of a plant's node."""
+        """Process the liveliness token of a plant's node; a recorder's may be of all plants and show none."""
         topic = keys.parse(token)
-        if topic is not None and topic.kind == keys.ALIVE and is_alive:
+        if topic is not None and topic.kind == keys.ALIVE and topic.name != "recorder" and is_alive:
             self.register(topic.plant, now_ns, verified=True)
         return []
 

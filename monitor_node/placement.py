@@ -147,7 +147,8 @@ class _Placement:
         stop: StopSignal,
         changed: asyncio.Event,
     ) -> None:
-        self._client, self._address, self._beginning = client, address, beginning
+        self._client: Any = client  # its annotations do not say which of its methods are coroutines here
+        self._address, self._beginning = address, beginning
         self._stop, self._changed = stop, changed
         digests = {shard: blake2b(text.encode(), digest_size=8).hexdigest() for shard, text in settings.items()}
         self._shards = {f"{beginning}{shard} {digests[shard]}": shard for shard in settings}
@@ -162,8 +163,11 @@ class _Placement:
         """Submit what does not run, until a stop is requested.
 
         Raises:
-            OSError: the connection was lost.
+            OSError: the connection was lost, or the scheduler does not answer.
         """
+        # The first worker of a new scheduler would get all shards, which leave it again one by one, seconds later.
+        with suppress(TimeoutError):
+            await self._client.wait_for_workers(len(self._shards), timeout=CONNECT_WITHIN_S)
         await self._end(self._shards)
         while not self._stop.is_set:
             self._changed.clear()
@@ -211,7 +215,8 @@ class _Placement:
 
     async def _look(self) -> None:
         """Log shards that have come to another worker, or wait for one."""
-        places = {key: worker for worker, keys in (await self._client.processing()).items() for key in keys}
+        by_worker = await asyncio.wait_for(self._client.processing(), CONNECT_WITHIN_S)
+        places = {key: worker for worker, keys in by_worker.items() for key in keys}
         for key, shard in self._shards.items():
             place = places.get(key, "")
             if place == self._places.get(key, "none yet"):

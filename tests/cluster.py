@@ -61,12 +61,12 @@ class Cluster:
             process.wait()
 
     def _start(self, *command: str) -> "subprocess.Popen[bytes]":
-        ttl = {"DASK_DISTRIBUTED__SCHEDULER__WORKER_TTL": "5s"}
+        shipped = {"DASK_CONFIG": str(Path(__file__).parents[1] / "deploy" / "dask")}
         with (self._folder / f"{command[0]}.log").open("ab") as output:
             return subprocess.Popen(
                 [sys.executable, "-m", "dask", *command],
                 cwd=self._folder,
-                env={**os.environ, **ttl, **self._settings},
+                env={**os.environ, **shipped, **self._settings},
                 stdout=output,
                 stderr=output,
                 start_new_session=True,

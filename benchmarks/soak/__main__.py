@@ -5,23 +5,30 @@ garbage run for minutes. From a seed: a quarter of the plants get a large fault 
 monitors and the router are killed and started again, links are cut for seconds, floods come. In the end every sample is
 accounted for, every fault was alarmed once, and memory is level: see `findings`.
 
-    python -m benchmarks.soak [minutes] [plants] [seed] [rows a second of each plant]
+    python -m benchmarks.soak [minutes] [plants] [seed] [rows a second of each plant] [--cluster]
+
+With `--cluster` the shards are placed on a Dask cluster instead, and what is killed, stopped and cut off is its
+workers, the scheduler and the command that places them: see `cluster`.
 """
 
 import contextlib
+import dataclasses
 import shutil
 import sys
 import tempfile
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
-from benchmarks.soak.findings import Findings, assess, count_unaccounted
+from benchmarks.soak.cluster import Cluster
+from benchmarks.soak.findings import Findings, Placement, assess, count_unaccounted
 from benchmarks.soak.plan import KNOWN_ROWS, Plan, draw_plan
 from benchmarks.soak.site import MONITORS, Site, Witness
 from reactorwatch.runtime.node_main import configure_log
 
 MINUTES, PLANTS = 10.0, 200
 ROWS_PER_S = 2.0
+CLUSTER, SHARDS = "--cluster", 5
 CATCH_UP_S = 60.0
 """A monitor that evaluates no row for this long has finished."""
 
@@ -29,13 +36,14 @@ CATCH_UP_S = 60.0
 def soak(plan: Plan, folder: Path, *, tell: bool = False) -> Findings:
     """Run a soak and assess it."""
     zero_ns = time.time_ns()
-    with Site(plan, folder, zero_ns) as site, contextlib.closing(Witness(site.bus)) as witness:
+    make = Cluster if plan.shards else Site
+    with make(plan, folder, zero_ns) as site, contextlib.closing(Witness(site.bus)) as witness:
         site.start_monitors()
-        witness.wait_for_monitors(MONITORS)
+        witness.wait_for_monitors(plan.shards or MONITORS)
         site.start_plants()
         site.allow(KNOWN_ROWS)
         site.wait_for_row(KNOWN_ROWS - 1)
-        site.begin_garbage()
+        site.begin_disturbances()
         for blow in plan.blows:
             site.allow(blow.row + 1)
             site.wait_for_row(blow.row)
@@ -44,7 +52,7 @@ def soak(plan: Plan, folder: Path, *, tell: bool = False) -> Findings:
                     f"row {site.row:6d}: {blow.kind}, {blow.manner} for {blow.rows} rows, {blow.monitor + 1}",
                     flush=True,
                 )
-            site.disturb(blow, witness.wait_for_monitors)
+            site.disturb(blow, witness)
         site.allow(plan.rows)
         site.wait_for_row(plan.rows - 1)
         garbage = site.end_garbage()
@@ -52,7 +60,10 @@ def soak(plan: Plan, folder: Path, *, tell: bool = False) -> Findings:
         while rows < (rows := sum(item.rows for item in witness.health.values())):  # as long as they go on
             if witness.wait(lambda: all(_is_complete(plan, witness, plant) for plant in plan.plants), CATCH_UP_S):
                 break
-        return assess(plan, zero_ns, witness.alarms, witness.health, witness.longest_lag_ms, garbage, site.memory)
+        lag_ms = witness.longest_lag_ms
+        findings = assess(plan, zero_ns, witness.alarms, witness.health, lag_ms, garbage, site.memory)
+        placement = site.placement(witness) if isinstance(site, Cluster) else None
+        return dataclasses.replace(findings, placement=placement)
 
 
 def _is_complete(plan: Plan, witness: Witness, plant: str) -> bool:
@@ -78,6 +89,8 @@ def table(plan: Plan, findings: Findings) -> str:
         f"{findings.standing_silences}",
         f"longest wait in a monitor           {findings.lag_ms / 1e3:.1f} s; {findings.stalls} stalls of a second",
     ]
+    if findings.placement is not None:
+        lines += _placement_lines(findings.placement)
     for name, (first, middle, last) in findings.memory_mb.items():
         grown = findings.grown_mb.get(name)
         change = "restarted" if grown is None else f"median {grown:+.1f} MB from the second to the last"
@@ -87,14 +100,32 @@ def table(plan: Plan, findings: Findings) -> str:
     return "\n".join(lines)
 
 
+def _placement_lines(placement: Placement) -> Iterator[str]:
+    """Format the findings about the placement."""
+    for what, items in (
+        ("all plants judged again", placement.recoveries),
+        ("monitors from before end", placement.ends),
+    ):
+        for kind in dict.fromkeys(kind for kind, _ in items):
+            times = ("never" if after_s is None else f"{after_s:.1f}" for other, after_s in items if other == kind)
+            yield f"{kind:35s} {what} after {', '.join(times)} s"
+    if placement.skipped:
+        yield f"cut worker                          skipped: {placement.skipped}"
+    shares = ", ".join(f"{name} {percent:.2f}" for name, percent in placement.cpu_percent.items())
+    yield f"placement, % of a core              {sum(placement.cpu_percent.values()):.2f} ({shares})"
+    yield f"starts                              {', '.join(f'{name}: {n}' for name, n in placement.starts.items())}"
+
+
 def main() -> int:
     """Run a soak and print its findings; returns 1 if it failed."""
     configure_log()
-    minutes = float(sys.argv[1]) if len(sys.argv) > 1 else MINUTES
-    plants = int(sys.argv[2]) if len(sys.argv) > 2 else PLANTS
-    seed = int(sys.argv[3]) if len(sys.argv) > 3 else time.time_ns() % 1_000_000
-    rows_per_s = float(sys.argv[4]) if len(sys.argv) > 4 else ROWS_PER_S
-    plan = draw_plan(seed, plants, round(60.0 * minutes * rows_per_s), rows_per_s)
+    numbers = [argument for argument in sys.argv[1:] if argument != CLUSTER]
+    minutes = float(numbers[0]) if numbers else MINUTES
+    plants = int(numbers[1]) if len(numbers) > 1 else PLANTS
+    seed = int(numbers[2]) if len(numbers) > 2 else time.time_ns() % 1_000_000
+    rows_per_s = float(numbers[3]) if len(numbers) > 3 else ROWS_PER_S
+    shards = SHARDS if CLUSTER in sys.argv else 0
+    plan = draw_plan(seed, plants, round(60.0 * minutes * rows_per_s), rows_per_s, shards)
     print(
         f"seed {seed}: {plants} plants, {plan.rows} rows, {rows_per_s:g} a second, {len(plan.blows)} blows", flush=True
     )

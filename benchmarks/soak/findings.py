@@ -21,6 +21,7 @@
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from statistics import median
 from typing import NamedTuple
@@ -38,6 +39,7 @@ from recorder.tools.player import samples_of
 SIGNALS = 3
 SOON_ROWS = 20
 SILENCE = "silence/"
+UNDERWAY_ROWS = 3  # which may have been published when a blow was struck, beside the one that was known
 ROW_NS = round(PERIOD_MIN * MINUTE_NS)
 
 
@@ -90,6 +92,64 @@ def _thirds(taken: Sequence[Taken], rows: int) -> list[list[Taken]]:
     return thirds
 
 
+class Judged(NamedTuple):
+    """Number of rows of a plant that were judged at one time."""
+
+    time_s: float  # time of the computer's clock
+    rows: int  # number of rows since the start of the plant
+    start_s: float  # start of the monitor
+
+
+class Strike(NamedTuple):
+    """A blow to a cluster that was struck."""
+
+    kind: str  # kind of the disturbance
+    row: int  # row of the plants that was published last
+    time_s: float  # time of the computer's clock
+    plants: Sequence[str]  # plants of the shards that it may concern
+    is_gradual: bool  # True if their monitors end some time after it
+
+    def recovery_s(self, judged: Mapping[str, Sequence[Judged]]) -> float | None:
+        """Time until a row that was published after the blow was judged of each plant; None: not all were."""
+        row, start_s = self.row + UNDERWAY_ROWS, self.time_s if self.is_gradual else 0.0
+        times = [
+            next((item.time_s for item in judged.get(plant, ()) if item.rows > row and item.start_s >= start_s), None)
+            for plant in self.plants
+        ]
+        return max(time_s - self.time_s for time_s in times if time_s is not None) if None not in times else None
+
+
+def count_superseded(judged: Mapping[str, Sequence[Judged]]) -> int:
+    """Count the plants with health of a monitor after that of its successor, which started half a second later."""
+    return sum(any(b.start_s < a.start_s - 0.5 for a, b in pairwise(items)) for items in judged.values())
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Findings about the placement of shards on a cluster."""
+
+    recoveries: list[tuple[str, float | None]]  # kind of each blow, and the seconds until all plants were judged again
+    cpu_percent: dict[str, float]  # share of a core while nothing was disturbed; without the monitors themselves
+    ends: list[tuple[str, float | None]]  # of each stop or cut, and of the scheduler: seconds from it being over to
+    # the end of the last monitor from before; None: one did not end
+    superseded: int  # number of plants with health of a monitor after that of its successor
+    starts: dict[str, int]  # number of starts of each service
+    skipped: str  # reason why no worker was cut off
+
+    def failures(self, within_s: float, cpu_percent: float) -> Iterator[str]:
+        """Yield a line for each broken promise."""
+        for kind, after_s in self.recoveries:
+            if after_s is None or after_s > within_s:
+                yield f"{kind}: plants are judged again after {after_s} s"
+        if (total := sum(self.cpu_percent.values())) > cpu_percent:
+            yield f"the placement takes {total:.1f} % of a core"
+        for kind, after_s in self.ends:
+            if after_s is None:
+                yield f"{kind}: a monitor from before does not end"
+        if self.superseded:
+            yield f"{self.superseded} plants have health of a monitor after that of its successor"
+
+
 class Change(NamedTuple):
     """A change of an alarm."""
 
@@ -123,12 +183,19 @@ class Findings:
     standing_silences: int  # number of silences that were not over in the end
     memory_mb: dict[str, tuple[float, float, float]]  # largest memory of each process in each third of the run
     grown_mb: dict[str, float]  # for each process that ran since the first third
+    placement: Placement | None = None  # of shards on a cluster
 
-    def failures(self, growth_mb: float = GROWTH_MB) -> Iterator[str]:
+    def failures(
+        self, growth_mb: float = GROWTH_MB, recovery_s: float = 20.0, cpu_percent: float = 2.0
+    ) -> Iterator[str]:
         """Yield a line for each broken promise."""
         for plant, samples in self.unaccounted.items():
             yield f"{plant}: samples unaccounted for: {samples}"
-        if not 0 < sum(self.refused.values()) <= self.garbage:
+        if self.placement is not None:
+            yield from self.placement.failures(recovery_s, cpu_percent)
+            if self.lost or self.late:
+                yield f"{self.lost} samples were lost and {self.late} late, all of which the publishers kept"
+        if not bool(self.garbage) <= sum(self.refused.values()) <= self.garbage:
             yield f"{sum(self.refused.values())} messages were refused, of {self.garbage} garbage messages"
         for plant, why in self.not_once.items():
             yield f"{plant}: not alarmed once: {why}"

@@ -51,7 +51,10 @@ FAULTS = (
 )
 """Faults so large that alarms are raised within five rows and stay active."""
 
-Kind = Literal["kill monitor", "cut monitor", "cut plants", "kill router", "flood"]
+Kind = Literal[
+    "kill monitor", "cut monitor", "cut plants", "kill router", "flood",
+    "kill worker", "stop worker", "cut worker", "kill client", "kill scheduler",
+]  # fmt: skip
 Manner = Literal["closed", "stalled"]
 
 KINDS: tuple[tuple[Kind, Manner], ...] = (
@@ -66,6 +69,17 @@ KINDS: tuple[tuple[Kind, Manner], ...] = (
 """Disturbances of the processes. Each comes once before any comes again. Only the second monitor is killed, so that the
 memory of the first is measured over the whole run."""
 
+CLUSTER_KINDS: dict[Kind, float] = {
+    "kill worker": 15.0,
+    "stop worker": 30.0,
+    "cut worker": 30.0,
+    "kill client": 10.0,
+    "kill scheduler": 2.0,
+}
+"""Disturbances of a cluster, with their durations in seconds: how long the process is gone, or its machine stopped or
+cut off. Each comes once; those of a worker come again."""
+
+CLUSTER_BLOW_EVERY_S = 50.0
 
 WATCH = MonitorConfig(
     training_min=TRAINING_ROWS * PERIOD_MIN,
@@ -84,7 +98,7 @@ class Blow(NamedTuple):
     row: int  # row of the plants at which it comes
     kind: Kind  # kind of the disturbance
     manner: Manner  # manner of a cut: closed, as when a machine is switched off, or stalled, as when a cable is pulled
-    monitor: int  # index of the monitor
+    monitor: int  # index of the monitor; of a worker, that of the shard that it runs
     rows: int  # duration in rows
 
 
@@ -104,6 +118,7 @@ class Plan(NamedTuple):
     plants: tuple[str, ...]  # names of the plants
     faults: dict[str, Fault]  # fault of each plant that has one
     blows: tuple[Blow, ...]  # disturbances in order of time
+    shards: int = 0  # number of shards that are placed on a cluster; 0: two monitors are started without one
     monitor: MonitorConfig = WATCH  # settings of the monitors
 
     def plant(self, name: str, zero_ns: int) -> PlantConfig:
@@ -120,8 +135,8 @@ class Plan(NamedTuple):
         )
 
 
-def draw_plan(seed: int, plants: int, rows: int, rows_per_s: float) -> Plan:
-    """Draw a plan."""
+def draw_plan(seed: int, plants: int, rows: int, rows_per_s: float, shards: int = 0) -> Plan:
+    """Draw a plan; that of a cluster with any number of shards has the same faults."""
     first = TRAINING_ROWS + SETTLED_ROWS
     if rows <= first + LAST_ROWS:
         raise InputError(
@@ -133,6 +148,9 @@ def draw_plan(seed: int, plants: int, rows: int, rows_per_s: float) -> Plan:
         name: Fault(draw.choice(FAULTS), draw.randrange(first, rows - LAST_ROWS))
         for name in sorted(draw.sample(names, round(FAULTY * plants)))
     }
+    if shards:
+        blows = _draw_cluster_blows(draw, rows, rows_per_s, shards)
+        return Plan(seed, rows, rows_per_s, names, faults, blows, shards)
     count = max(len(KINDS), round(rows / rows_per_s / BLOW_EVERY_S))
     share = (rows - LAST_ROWS) / (count + 1)  # the first of these is left in peace
     kinds: list[tuple[Kind, Manner]] = []
@@ -149,3 +167,22 @@ def draw_plan(seed: int, plants: int, rows: int, rows_per_s: float) -> Plan:
         for number, (kind, manner) in enumerate(kinds[:count], start=1)
     )
     return Plan(seed, rows, rows_per_s, names, faults, blows)
+
+
+def _draw_cluster_blows(draw: random.Random, rows: int, rows_per_s: float, shards: int) -> tuple[Blow, ...]:
+    """Draw the disturbances of a cluster, evenly spaced: each lasts for most of the time until the next."""
+    count = max(len(CLUSTER_KINDS), round(rows / rows_per_s / CLUSTER_BLOW_EVERY_S))
+    kinds = draw.sample(list(CLUSTER_KINDS), len(CLUSTER_KINDS))
+    repeated = [kind for kind in kinds if kind.endswith("worker")]
+    kinds += [repeated[number % len(repeated)] for number in range(count - len(kinds))]
+    last = rows - LAST_ROWS - max(CLUSTER_KINDS.values()) * rows_per_s
+    return tuple(
+        Blow(
+            row=round(number * last / count),
+            kind=kind,
+            manner="stalled",
+            monitor=draw.randrange(shards),
+            rows=round(CLUSTER_KINDS[kind] * rows_per_s),
+        )
+        for number, kind in enumerate(kinds, start=1)
+    )

@@ -7,6 +7,7 @@ The links of both monitors and of the second half of the plants go through proxi
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ import msgspec
 
 from benchmarks.harness.site import Proxy, Router, connect_client
 from benchmarks.soak import garbage, publisher
-from benchmarks.soak.findings import Taken, own_memory_mb
+from benchmarks.soak.findings import Judged, Taken, own_memory_mb
 from benchmarks.soak.plan import Blow, Plan
 from monitor_node.fleet import FleetConfig
 from monitor_node.health import NODE
@@ -24,7 +25,7 @@ from reactorwatch.contract import keys
 from reactorwatch.contract.codec import DecodeError, Encoded, decode
 from reactorwatch.contract.messages_pb2 import Alarm, Health
 from reactorwatch.runtime.config import BusConfig
-from reactorwatch.runtime.http_pages import free_endpoint
+from reactorwatch.runtime.http_pages import LOOPBACK, free_endpoint
 
 ROOT = Path(__file__).parents[2]
 MONITORS = PARTS = 2
@@ -71,9 +72,9 @@ class Lines:
 class Site:
     """The processes, as long as the context lasts."""
 
-    def __init__(self, plan: Plan, folder: Path, zero_ns: int) -> None:
+    def __init__(self, plan: Plan, folder: Path, zero_ns: int, address: str = LOOPBACK) -> None:
         self._plan, self._folder, self._zero_ns = plan, folder, zero_ns
-        endpoint = free_endpoint()
+        endpoint = free_endpoint().replace(LOOPBACK, address)
         self.bus = BusConfig(endpoint=endpoint, cache_messages=round(KEPT_S * plan.rows_per_s), history_s=KEPT_S)
         self.router = Router(endpoint)
         self._proxies = [Proxy(endpoint) for _ in range(MONITORS + 1)]
@@ -101,9 +102,9 @@ class Site:
             process = self._start(publisher, task)
             self._plants.append(process)
             self._said[f"plants {part + 1}"] = Lines(process, self._measure if part == 0 else lambda _: None)
-        garbage_task = garbage.Task(plan.seed, plan.plants, self._zero_ns, self.bus)
-        self._garbage = self._start(garbage, garbage_task)
-        self._said["garbage"] = Lines(self._garbage)
+        if not plan.shards:  # on a cluster, what is late or lost was lost by the placement
+            self._garbage = self._start(garbage, garbage.Task(plan.seed, plan.plants, self._zero_ns, self.bus))
+            self._said["garbage"] = Lines(self._garbage)
         for said in self._said.values():
             said.wait_for(lambda lines: bool(lines))
 
@@ -123,14 +124,15 @@ class Site:
         last = self._said["plants 1"].lines[-1]
         return -1 if last == "ready" else int(last)
 
-    def begin_garbage(self) -> None:
-        """Start the garbage."""
+    def begin_disturbances(self) -> None:
+        """The plants are known; begin the garbage."""
         assert self._garbage is not None
         _tell(self._garbage, "begin")
 
     def end_garbage(self) -> int:
         """End the garbage; returns the number of its messages."""
-        assert self._garbage is not None
+        if self._garbage is None:
+            return 0
         assert self._garbage.stdin is not None
         self._garbage.stdin.close()
         self._garbage.wait(PATIENCE_S)
@@ -174,14 +176,14 @@ class Site:
 
     # --- disturbances ---------------------------------------------------------------------------------------
 
-    def disturb(self, blow: Blow, wait_for_monitors: Callable[[int], None]) -> None:
+    def disturb(self, blow: Blow, witness: "Witness") -> None:
         """Strike a blow, and wait until all processes are there again."""
         end = blow.row + blow.rows
         self.allow(end + 1)
         if blow.kind == "kill monitor":
             self._monitors[blow.monitor].kill()
             self._monitors[blow.monitor].wait()
-            wait_for_monitors(MONITORS - 1)
+            witness.wait_for_monitors(MONITORS - 1)
             self.wait_for_row(end)
             self._monitors[blow.monitor] = self._monitor(blow.monitor)
         elif blow.kind == "kill router":
@@ -196,7 +198,7 @@ class Site:
         else:
             with self._proxies[blow.monitor if blow.kind == "cut monitor" else MONITORS].cut(blow.manner):
                 self.wait_for_row(end)
-        wait_for_monitors(MONITORS)
+        witness.wait_for_monitors(MONITORS)
 
     # --- memory ----------------------------------------------------------------------------------------------
 
@@ -224,10 +226,12 @@ class Witness:
 
     def __init__(self, config: BusConfig) -> None:
         self._changed = threading.Condition()
-        self._tokens: set[str] = set()
+        self.tokens: set[str] = set()
         self.alarms: dict[str, list[Alarm]] = {}
         self.health: dict[str, Health] = {}
         self.longest_lag_ms = 0.0
+        self.judged: dict[str, list[Judged]] = {}
+        """Number of judged rows of each plant, whenever its health arrived."""
         self._bus = connect_client(config)
         self._bus.subscribe_liveliness(f"{keys.ROOT}/{keys.FLEET}/**", self._on_token)
         self._bus.subscribe(f"{FLEET}/{keys.ALARM}/**", self._on_message)
@@ -235,7 +239,7 @@ class Witness:
 
     def wait_for_monitors(self, count: int) -> None:
         """Wait for a number of live monitors."""
-        assert self.wait(lambda: len(self._tokens) == count), f"not {count} monitors, but {self._tokens}"
+        assert self.wait(lambda: len(self.tokens) == count), f"not {count} monitors, but {self.tokens}"
 
     def wait(self, condition: Callable[[], bool], within_s: float = PATIENCE_S) -> bool:
         """Wait for a condition on the messages; returns True if it holds."""
@@ -248,7 +252,7 @@ class Witness:
 
     def _on_token(self, key: str, is_alive: bool) -> None:
         with self._changed:
-            (self._tokens.add if is_alive else self._tokens.discard)(key)
+            (self.tokens.add if is_alive else self.tokens.discard)(key)
             self._changed.notify_all()
 
     def _on_message(self, message: Encoded) -> None:
@@ -263,6 +267,8 @@ class Witness:
             if isinstance(body, Health):
                 self.health[topic.plant] = body
                 self.longest_lag_ms = max(self.longest_lag_ms, body.lag_ms)
+                start_s = body.time_ns / 1e9 - body.uptime_s
+                self.judged.setdefault(topic.plant, []).append(Judged(time.time(), body.rows, start_s))
             elif isinstance(body, Alarm) and body.alarm == topic.name:
                 self.alarms.setdefault(topic.plant, []).append(body)
             self._changed.notify_all()

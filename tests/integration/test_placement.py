@@ -60,15 +60,15 @@ class Site:
     """A cluster, and the command that places the shards on it."""
 
     def __init__(self, bus: BusConfig, folder: Path, shards: int, settings: dict[str, str]) -> None:
-        self._folder, self._shards = folder, shards
+        self._folder = folder
         write_settings(folder / "settings.toml", {"bus": bus, "monitor": QUICK})
         self.cluster = Cluster(folder, settings)
-        self.command, self.log = self.start()
+        self.command, self.log = self.start(shards)
 
-    def start(self) -> "tuple[subprocess.Popen[str], Lines]":
+    def start(self, shards: int = 2) -> "tuple[subprocess.Popen[str], Lines]":
         """Start the command; returns it with the lines of its log."""
         where = ("--scheduler", self.cluster.address, "--state", str(self._folder / "states"))
-        what = ("--plants", "reactor/*", "--shards", str(self._shards), "--config", str(self._folder / "settings.toml"))
+        what = ("--plants", "reactor/*", "--shards", str(shards), "--config", str(self._folder / "settings.toml"))
         command = [sys.executable, "-m", "reactorwatch", "monitor", *what, *where]
         pipe = subprocess.PIPE
         self.command = subprocess.Popen(command, stdout=pipe, stderr=subprocess.STDOUT, text=True)
@@ -112,6 +112,19 @@ def test_a_killed_command_finds_its_shards_again_and_a_stopped_one_ends_them(
         monitors.wait_for(lambda shards: not shards)
         log.close()
         assert not [line for line in log.lines if "ended" in line]
+
+
+@pytest.mark.slow
+def test_after_a_change_of_the_settings_the_shards_of_a_killed_command_are_replaced(
+    bus_config: BusConfig, tmp_path: Path
+) -> None:
+    with placed(bus_config, tmp_path, shards=2, workers=3) as (site, monitors):
+        first = monitors.wait_for(lambda shards: len(shards) == 2)
+        site.command.kill()
+        site.command.wait()
+        site.start(shards=3)
+        others = monitors.wait_for(lambda shards: set(shards) == {"1/3", "2/3", "3/3"})
+        assert not set(others.values()) & set(first.values())
 
 
 @pytest.mark.slow

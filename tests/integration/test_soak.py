@@ -5,8 +5,11 @@ into starting processes, and on a machine with other things to do 200 plants wou
 happens is counted in rows of the plants, which wait for it, so that a slow machine does the same, later. A minute is
 too short for memory to be level, as buffers grow to what the first flood wants; only what grows without end would be
 found.
+
+On a Dask cluster there are five rows a second, as a worker that was stopped or cut off is away for thirty seconds.
 """
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -14,8 +17,8 @@ import pytest
 from msgspec.structs import replace
 
 from benchmarks.soak.__main__ import soak, table
-from benchmarks.soak.findings import ROW_NS, Change, count_unaccounted, why_not_once
-from benchmarks.soak.plan import KINDS, draw_plan
+from benchmarks.soak.findings import ROW_NS, Change, Judged, Strike, count_unaccounted, why_not_once
+from benchmarks.soak.plan import CLUSTER_KINDS, KINDS, draw_plan
 from reactorwatch.contract.messages_pb2 import Health
 
 ROWS = 500
@@ -39,6 +42,37 @@ def test_in_a_minute_of_kills_cuts_and_garbage_no_sample_is_unaccounted_for_and_
     assert not broken, "\n".join([*broken, table(plan, findings)])
     assert (findings.alarmed_once, len(findings.memory_mb)) == (len(plan.faults), 5)
     assert {"monitor 1", "plants 1", "plants 2"} <= findings.grown_mb.keys()
+
+
+@pytest.mark.slow
+def test_on_a_cluster_every_sample_is_judged_once_whatever_is_killed_stopped_or_cut_off(tmp_path: Path) -> None:
+    pytest.importorskip("distributed", reason="Dask (reactorwatch[cluster]) is not installed")
+    plan = draw_plan(SEED, PLANTS, rows=600, rows_per_s=5.0, shards=3)
+    plan = plan._replace(monitor=replace(plan.monitor, diagnose_training=False))
+    findings = soak(plan, tmp_path)
+    broken = list(findings.failures(GROWTH_MB, recovery_s=math.inf, cpu_percent=math.inf))
+    assert not broken, "\n".join([*broken, table(plan, findings)])
+    assert findings.placement is not None
+    skipped = {"cut worker"} if findings.placement.skipped else set()
+    assert {kind for kind, _ in findings.placement.recoveries} == CLUSTER_KINDS.keys() - skipped
+    assert findings.alarmed_once == len(plan.faults)
+
+
+@pytest.mark.parametrize(
+    ("is_gradual", "recovery_s"),
+    [(False, 12.0), (True, 15.0)],
+)
+def test_a_shard_has_recovered_when_a_row_after_the_blow_was_judged_of_each_of_its_plants(
+    is_gradual: bool, recovery_s: float
+) -> None:
+    """The blow comes at 100 s, after row 50; where monitors end later, the old one of `a` still judges."""
+    strike = Strike("kill worker", 50, 100.0, ("a", "b"), is_gradual)
+    judged = {
+        "a": [Judged(99.0, 51, 0.0), Judged(103.0, 60, 0.0), Judged(115.0, 60, 110.0)],
+        "b": [Judged(99.0, 51, 0.0), Judged(110.0, 51, 110.0), Judged(112.0, 60, 110.0)],
+    }
+    assert strike.recovery_s(judged) == recovery_s
+    assert strike.recovery_s(judged | {"b": judged["b"][:2]}) is None
 
 
 @pytest.mark.parametrize(

@@ -230,6 +230,9 @@ NOT_PLANTS = "plants must be reactor/ and a name with or without '*'"
 NO_SHARD = "shard must be like 2/5, the second of five"
 
 
+ON_CLUSTER = ["--plants", "reactor/*", "--shards", "5", "--scheduler", "tcp://127.0.0.1:1", "--state", "states"]
+
+
 def error_line(options: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> str:
     """The line that the command ends with."""
     monkeypatch.setattr(sys, "argv", ["reactorwatch", "monitor", "--endpoint", "tcp/127.0.0.1:1", *options])
@@ -264,6 +267,15 @@ def test_a_shard_that_is_none(shard: str, monkeypatch: pytest.MonkeyPatch, capsy
         (["--shard", "1/2"], "--shard is a part of the plants that --plants names; give both"),
         (["--plants", "reactor/*", "--plant", "x"], "--plant is for the monitor of one plant"),
         (["--plants", "reactor/*", "--diagnose", "x"], "--diagnose is for the monitor of one plant"),
+        (["--scheduler", "tcp://127.0.0.1:1"], "a folder that all workers see; add --plants"),
+        (["--plants", "reactor/*", "--scheduler", "tcp://127.0.0.1:1"], "add --shards"),
+        (["--plants", "reactor/*", "--shards", "5"], "add --scheduler"),
+        (["--plants", "reactor/*", "--shards", "5", "--scheduler", "tcp://127.0.0.1:1"], "add --state"),
+        ([*ON_CLUSTER, "--shard", "1/5"], "--shard is one part of the plants, and --shards are all of them"),
+        ([*ON_CLUSTER, "--shards", "0"], "shards must be in [1, 1000], got 0"),
+        ([*ON_CLUSTER, "--process", "nowhere"], "nowhere"),
+        ([*ON_CLUSTER, "--scheduler", "10.0.0.3"], "scheduler must be like tls://10.0.0.3:8786"),
+        ([*ON_CLUSTER, "--scheduler", "tls://127.0.0.1:1"], "and certificates, of [fleet] identity or [bus], belong"),
     ],
 )
 def test_options_that_do_not_go_together(

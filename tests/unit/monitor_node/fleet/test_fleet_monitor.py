@@ -31,6 +31,8 @@ def test_a_batch_of_messages_gives_the_output_of_each_alone(
 def test_a_plant_is_watched_as_soon_as_a_node_of_it_is_alive() -> None:
     shown: list[tuple[str, bool]] = []
     monitor = fleet(on_watch=lambda plant, ours: shown.append((plant, ours)))
+    monitor.on_alive("reactor/fleet/alive/recorder", True, 0)  # of all plants
+    assert not monitor.plants
     monitor.on_alive("reactor/x/alive/plant", True, 0)
     assert monitor.plants == ["x"]
     assert shown == [("x", True)]

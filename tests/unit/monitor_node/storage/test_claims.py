@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -138,6 +139,31 @@ def test_a_monitor_of_one_plant_that_was_replaced_publishes_no_alarm_and_writes_
     node.on_stop(0)
     assert (tmp_path / "a.state").read_bytes() == stored
     second.on_stop(0)
+
+
+@pytest.mark.usefixtures("local")
+@pytest.mark.parametrize(
+    "wake",
+    [
+        lambda node, run: node.on_messages(run, 2_000_000_000),
+        lambda node, _run: node.on_tick(2_000_000_000),
+        lambda node, run: (node.on_messages(run, 999_999_999), node.on_tick(1_000_000_000)),
+    ],
+    ids=["by samples", "by time", "within a second"],
+)
+def test_a_shard_on_a_cluster_that_was_replaced_while_it_was_stalled_ends_before_it_publishes(
+    tmp_path: Path, wake: Callable[[MonitorNode, list[Encoded]], object]
+) -> None:
+    """Also where the folder is on a local file system, whose locks a stalled process holds."""
+    fleet = FleetConfig(plants="reactor/*", state=str(tmp_path), shard="1/1", scheduler="tcp://127.0.0.1:8786")
+    first = MonitorNode(QUICK, 0, fleet)
+    first.on_alive("reactor/a/alive/plant", True, 0)
+    first.on_messages(run_of("a", 1, span_min=1.0), 0)
+    second = MonitorNode(QUICK, 0, fleet)
+    with pytest.raises(InputError, match="was claimed by another monitor, which uses it from now on"):
+        wake(first, run_of("a", 1, span_min=2.0)[30:])
+    second.on_tick(3_000_000_000)
+    second.on_stop(3_000_000_000)
 
 
 def test_a_mount_of_a_network_within_a_local_file_system_is_not_local(
