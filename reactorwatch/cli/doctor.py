@@ -2,7 +2,7 @@
 
 A router refuses messages silently, so a node without the right to publish looks like one with nothing to publish. The
 doctor therefore publishes a message and receives it in a second session of the same certificate: below `@doctor`, where
-the same role may publish the same kinds, and no node subscribes. Of a fleet's Dask cluster it checks who can run code.
+the same role may publish the same kinds, and no node subscribes. It checks the Dask cluster of a fleet, too.
 """
 
 import shutil
