@@ -5,6 +5,7 @@ that is slow.
 """
 
 import random
+from itertools import accumulate
 from typing import Literal, NamedTuple
 
 from monitor_node.config import MonitorConfig
@@ -170,19 +171,17 @@ def draw_plan(seed: int, plants: int, rows: int, rows_per_s: float, shards: int 
 
 
 def _draw_cluster_blows(draw: random.Random, rows: int, rows_per_s: float, shards: int) -> tuple[Blow, ...]:
-    """Draw the disturbances of a cluster, evenly spaced: each lasts for most of the time until the next."""
-    count = max(len(CLUSTER_KINDS), round(rows / rows_per_s / CLUSTER_BLOW_EVERY_S))
+    """Draw the disturbances of a cluster, with equal pauses, after the training: all plants end theirs at once."""
     kinds = draw.sample(list(CLUSTER_KINDS), len(CLUSTER_KINDS))
-    repeated = [kind for kind in kinds if kind.endswith("worker")]
-    kinds += [repeated[number % len(repeated)] for number in range(count - len(kinds))]
-    last = rows - LAST_ROWS - max(CLUSTER_KINDS.values()) * rows_per_s
+    workers = [kind for kind in kinds if kind.endswith("worker")]
+    while len(kinds) < round(rows / rows_per_s / CLUSTER_BLOW_EVERY_S):
+        kinds.append(workers[len(kinds) % len(workers)])
+    first, lengths = TRAINING_ROWS + SETTLED_ROWS, [round(CLUSTER_KINDS[kind] * rows_per_s) for kind in kinds]
+    pause = (rows - LAST_ROWS - first - sum(lengths)) // len(kinds)
+    if pause < 0:
+        raise InputError(f"a soak of a cluster must have {-pause * len(kinds)} more rows of each plant, got {rows}")
+    starts = accumulate(lengths, lambda row, length: row + length + pause, initial=first)
     return tuple(
-        Blow(
-            row=round(number * last / count),
-            kind=kind,
-            manner="stalled",
-            monitor=draw.randrange(shards),
-            rows=round(CLUSTER_KINDS[kind] * rows_per_s),
-        )
-        for number, kind in enumerate(kinds, start=1)
+        Blow(row, kind, "closed" if "kill" in kind else "stalled", draw.randrange(shards), length)
+        for row, kind, length in zip(starts, kinds, lengths, strict=False)
     )

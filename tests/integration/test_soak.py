@@ -47,7 +47,7 @@ def test_in_a_minute_of_kills_cuts_and_garbage_no_sample_is_unaccounted_for_and_
 @pytest.mark.slow
 def test_on_a_cluster_every_sample_is_judged_once_whatever_is_killed_stopped_or_cut_off(tmp_path: Path) -> None:
     pytest.importorskip("distributed", reason="Dask (reactorwatch[cluster]) is not installed")
-    plan = draw_plan(SEED, PLANTS, rows=600, rows_per_s=5.0, shards=3)
+    plan = draw_plan(SEED, PLANTS, rows=800, rows_per_s=5.0, shards=3)
     plan = plan._replace(monitor=replace(plan.monitor, diagnose_training=False))
     findings = soak(plan, tmp_path)
     broken = list(findings.failures(GROWTH_MB, recovery_s=math.inf, cpu_percent=math.inf))
