@@ -2,7 +2,7 @@
 
 A router refuses messages silently, so a node without the right to publish looks like one with nothing to publish. The
 doctor therefore publishes a message and receives it in a second session of the same certificate: below `@doctor`, where
-the same role may publish the same kinds, and no node subscribes.
+the same role may publish the same kinds, and no node subscribes. It checks the Dask cluster of a fleet, too.
 """
 
 import shutil
@@ -13,20 +13,27 @@ from collections.abc import Iterator
 from datetime import datetime
 from ipaddress import ip_address
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from cryptography.exceptions import InvalidSignature
+from cryptography.x509 import Certificate
 
 from monitor_node.health import OtherMonitors
 from reactorwatch.cli.bus_client import certificate_holder, is_for_all_plants
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import DecodeError, Encoded, decode
 from reactorwatch.contract.messages_pb2 import Health
+from reactorwatch.errors import InputError
 from reactorwatch.runtime.acl import FLEET, kinds_of
 from reactorwatch.runtime.bus_zenoh import ZenohBus, connect_now
 from reactorwatch.runtime.certificates import read_certificate, read_common_name, read_key
 from reactorwatch.runtime.config import BusConfig
+from reactorwatch.runtime.jobs import inspect_cluster, one_line
+from reactorwatch.runtime.provisioning import CA, CERTIFICATE, CLUSTER_SETTINGS
 from reactorwatch.version import version
+
+if TYPE_CHECKING:
+    from monitor_node.fleet import FleetConfig
 
 RENEW_DAYS = 30
 """As `certify --renew 30` in the cure: a month to plan it."""
@@ -34,6 +41,8 @@ MAX_OFFSET_S = 1.0
 """Far above what NTP leaves, and below a period of samples."""
 REPEAT_S = 0.2
 """A subscription takes effect within it on a network of one site."""
+LOST_WITHIN_S = 10.0
+"""Dask takes five minutes by default to notice that a worker was stopped, and nothing watches its plants meanwhile."""
 NODES = ("plant", "monitor", "recorder")
 
 
@@ -80,21 +89,8 @@ def _check_certificate(config: BusConfig, plant: str, now: datetime) -> Iterator
         return
     own, ca = read_certificate(Path(config.certificate)), read_certificate(Path(config.ca))
     name = read_common_name(own)
-    renew = "renew it: `reactorwatch certify SITE --renew 30`, and copy the new folder"
-    for what, certificate in (("certificate", own), ("authority", ca)):
-        remaining = certificate.not_valid_after_utc - now
-        until = f"valid until {certificate.not_valid_after_utc:%Y-%m-%d %H:%M} UTC, {remaining.days} days"
-        holder_name = read_common_name(certificate)
-        if now < certificate.not_valid_before_utc:
-            begin = f"{certificate.not_valid_before_utc:%Y-%m-%d %H:%M} UTC"
-            yield Finding(
-                what, f"{holder_name}: not valid before {begin}", "set this machine's clock, or make it again"
-            )
-        elif remaining.days < RENEW_DAYS:
-            passed = remaining.total_seconds() <= 0
-            yield Finding(what, f"{holder_name}: expired" if passed else f"{holder_name}: {until}", renew)
-        else:
-            yield Finding(what, f"{holder_name}: {until}")
+    yield _check_dates("certificate", own, now)
+    yield _check_dates("authority", ca, now)
     key_file = Path(config.key)
     try:
         own.verify_directly_issued_by(ca)
@@ -110,6 +106,58 @@ def _check_certificate(config: BusConfig, plant: str, now: datetime) -> Iterator
     if holder is None or holder[0] not in (plant, keys.FLEET):
         cure = f"use a certificate of {plant}, or name its plant by --plant"
         yield Finding("identity", f"{name or 'a certificate without a name'}: has no role of plant {plant}", cure)
+
+
+def _check_dates(what: str, certificate: Certificate, now: datetime) -> Finding:
+    remaining = certificate.not_valid_after_utc - now
+    until = f"valid until {certificate.not_valid_after_utc:%Y-%m-%d %H:%M} UTC, {remaining.days} days"
+    holder_name = read_common_name(certificate)
+    if now < certificate.not_valid_before_utc:
+        begin = f"{certificate.not_valid_before_utc:%Y-%m-%d %H:%M} UTC"
+        return Finding(what, f"{holder_name}: not valid before {begin}", "set this machine's clock, or make it again")
+    if remaining.days < RENEW_DAYS:
+        passed = remaining.total_seconds() <= 0
+        renew = "renew it: `reactorwatch certify SITE --renew 30`, and copy the new folder"
+        return Finding(what, f"{holder_name}: expired" if passed else f"{holder_name}: {until}", renew)
+    return Finding(what, f"{holder_name}: {until}")
+
+
+def check_cluster(fleet: "FleetConfig", bus: BusConfig, now: datetime) -> Iterator[Finding]:
+    """Check the Dask cluster of a fleet's shards: which programs may run code there, and the room of its workers."""
+    from monitor_node.placement import RESOURCE, cluster_security
+
+    if (address := fleet.scheduler) is None:
+        return
+    use = f"use SITE/fleet/cluster: {CLUSTER_SETTINGS} for scheduler and workers, the folder as [fleet] identity"
+    is_open = not address.startswith("tls://")
+    if is_open and not _is_loopback(address.replace("//", "/")):
+        found = f"no certificates: every program that reaches {address} runs code as the workers"
+        yield Finding("cluster", found, f"{use}, with an address like tls://10.0.0.3:8786")
+    try:
+        if not is_open and (fleet.identity is None or _is_same(Path(fleet.identity) / CA, bus.ca)):
+            yield Finding("cluster", "has the site's authority: every member of the site runs code as the workers", use)
+        elif not is_open:
+            yield _check_dates("cluster", read_certificate(Path(str(fleet.identity)) / CERTIFICATE), now)
+        resources, lost_s = inspect_cluster(address, cluster_security(fleet, bus))
+    except InputError as error:
+        yield Finding("scheduler", f"{address} was not checked", str(error))
+        return
+    except OSError as error:
+        cure = "start it, or correct scheduler or identity in [fleet]"
+        yield Finding("scheduler", f"no way in at {address}: {one_line(error)}", cure)
+        return
+    shards, room = fleet.shards or 1, sum(item.get(RESOURCE, 0.0) for item in resources)
+    start = f"start more: dask worker {address} --nthreads 1 --no-nanny --resources {RESOURCE}=1"
+    found = f"{len(resources)} workers with room for {room:g} shards, for {shards}"
+    yield Finding("workers", found, start if room < shards else "")
+    if lost_s is None or lost_s > LOST_WITHIN_S:
+        found = f"removed {'never' if lost_s is None else f'{lost_s:g} s'} after its last answer, and its shards wait"
+        cure = f"set distributed.scheduler.worker-ttl to 2s, as {CLUSTER_SETTINGS} does, and restart the scheduler"
+        yield Finding("lost worker", found, cure)
+
+
+def _is_same(ca: Path, other: str | None) -> bool:
+    return other is not None and read_certificate(ca) == read_certificate(Path(other))
 
 
 def _check_disk(folder: Path, room_mb: float) -> Finding:

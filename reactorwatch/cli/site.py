@@ -116,16 +116,23 @@ def doctor(
 ) -> None:
     """Check a deployment from here: one line a check, with the cure. Ends with 0 if all checks pass, 1 if not."""
     from datetime import UTC, datetime
+    from itertools import chain
 
-    from reactorwatch.cli.bus_client import load_recorder_settings
-    from reactorwatch.cli.doctor import run_checks
+    from monitor_node.fleet import FleetConfig
+    from reactorwatch.cli.bus_client import load_settings
+    from reactorwatch.cli.doctor import check_cluster, run_checks
+    from reactorwatch.runtime.config import section
+    from recorder.config import RecorderConfig
 
-    bus, recorder = load_recorder_settings(target)
+    tables, bus = load_settings(target)
+    recorder = section(RecorderConfig, "recorder", tables, {"plant": target.name})
+    fleet, now = section(FleetConfig, "fleet", tables, {}), datetime.now(UTC)
     out = Path(recorder.out)
     folder = out.parent if out.suffix == ".mcap" else out
     is_well = True
     checks = []
-    for finding in run_checks(bus, recorder.plant, folder, recorder.rotate_mb, target.timeout, datetime.now(UTC)):
+    findings = run_checks(bus, recorder.plant, folder, recorder.rotate_mb, target.timeout, now)
+    for finding in chain(findings, check_cluster(fleet, bus, now)):
         is_well = is_well and not finding.cure
         checks.append({"ok": not finding.cure, **finding._asdict()})
         if not as_json:

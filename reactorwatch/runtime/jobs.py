@@ -421,6 +421,22 @@ def _wait_for_workers(client: Any, address: str) -> None:
         ) from error
 
 
+def inspect_cluster(address: str, security: Any) -> tuple[list[dict[str, float]], float | None]:
+    """Resources of each worker of a cluster, and the seconds after which its scheduler removes a silent worker.
+
+    Raises:
+        OSError: there is no scheduler, or it refuses the connection.
+    """
+    from distributed import Client
+
+    def look(dask_scheduler: Any) -> Any:  # pickled by value
+        return [worker.resources for worker in dask_scheduler.workers.values()], dask_scheduler.worker_ttl
+
+    with Client(address, security=security, timeout=CONNECT_WITHIN_S, set_as_default=False) as client:
+        resources, silent_s = client.run_on_scheduler(look)
+        return resources, silent_s
+
+
 def _version_query() -> Callable[[], str | None]:
     """Function that is pickled by value: a worker that cannot find a function by its name never answers."""
 

@@ -1,6 +1,10 @@
-"""The identity of a fleet's Dask cluster: a real scheduler and worker with the settings that `certify` writes."""
+"""The identity of a fleet's Dask cluster, and what `doctor` finds of it: a real scheduler and worker.
+
+They have the settings that `certify` writes.
+"""
 
 import datetime
+import sys
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
@@ -10,7 +14,9 @@ import pytest
 
 from monitor_node.fleet import FleetConfig
 from monitor_node.placement import cluster_security
-from reactorwatch.runtime.config import BusConfig
+from reactorwatch.cli.doctor import Finding, check_cluster
+from reactorwatch.runtime.config import BusConfig, read_settings, section
+from reactorwatch.runtime.http_pages import free_port
 from reactorwatch.runtime.provisioning import make_site
 from tests.cluster import Cluster
 
@@ -72,3 +78,61 @@ def test_no_other_certificate_of_the_site_reaches_the_cluster(
 def test_plain_tcp_does_not_reach_the_cluster(cluster: Cluster) -> None:
     with pytest.raises(OSError, match=r"reset by peer|timed out"):
         client(cluster.address.replace("tls:", "tcp:"), None, 3.0)
+
+
+def wrong(bus: BusConfig, **settings: Any) -> dict[str, Finding]:
+    """What `doctor` finds wrong, by check."""
+    fleet, now = FleetConfig(plants="reactor/*", **settings), datetime.datetime.now(datetime.UTC)
+    return {finding.check: finding for finding in check_cluster(fleet, bus, now) if finding.cure}
+
+
+def settings_of(site: Path, member: str) -> BusConfig:
+    return section(BusConfig, "bus", read_settings(site / member / "settings.toml"), {})
+
+
+def test_doctor_finds_nothing_wrong_with_a_cluster_and_its_identity(site: Path, cluster: Cluster) -> None:
+    identity, bus = str(site / "fleet" / "cluster"), settings_of(site, "fleet/monitor")
+    with client(cluster.address, Path(identity), WITHIN_S) as connected:
+        connected.wait_for_workers(1, timeout=WITHIN_S)
+    assert wrong(bus, scheduler=cluster.address, identity=identity, shards=1) == {}
+    found = wrong(bus, scheduler=cluster.address, identity=identity, shards=2)
+    assert found["workers"].found == "1 workers with room for 1 shards, for 2"
+    assert "--resources monitor=1" in found["workers"].cure
+
+
+def test_doctor_refuses_an_identity_that_every_member_of_the_site_could_have(site: Path) -> None:
+    address = f"tls://127.0.0.1:{free_port()}"
+    for identity in (None, str(site / "fleet" / "monitor")):
+        found = wrong(settings_of(site, "fleet/monitor"), scheduler=address, identity=identity)
+        assert "every member of the site" in found["cluster"].found
+        assert "SITE/fleet/cluster" in found["cluster"].cure
+        assert "no way in" in found["scheduler"].found
+
+
+@pytest.mark.parametrize("host", ["192.0.2.1", "scheduler.example"])  # both are set aside for documents
+def test_doctor_refuses_a_cluster_without_certificates_but_on_loopback(
+    monkeypatch: pytest.MonkeyPatch, host: str
+) -> None:
+    monkeypatch.setattr("reactorwatch.cli.doctor.inspect_cluster", lambda *_: ([{"monitor": 1.0}], 5.0))
+    found = wrong(BusConfig(), scheduler=f"tcp://{host}:8786")
+    assert found.keys() == {"cluster"}
+    assert "runs code as the workers" in found["cluster"].found
+    assert wrong(BusConfig(), scheduler="tcp://127.0.0.1:8786") == {}
+    assert "runs code" in wrong(BusConfig(), scheduler=f"tcp://{host}:8786", identity="cluster")["cluster"].found
+
+
+def test_doctor_reports_workers_without_the_resource_and_a_scheduler_that_notices_losses_late(tmp_path: Path) -> None:
+    with closing(Cluster(tmp_path, {"DASK_DISTRIBUTED__SCHEDULER__WORKER_TTL": "5 minutes"})) as plain:
+        with client(plain.address, None, WITHIN_S):  # it is there
+            pass
+        found = wrong(BusConfig(), scheduler=plain.address)
+    assert found.keys() == {"workers", "lost worker"}
+    assert found["workers"].found == "0 workers with room for 0 shards, for 1"
+    assert found["lost worker"].found == "removed 300 s after its last answer, and its shards wait"
+
+
+def test_doctor_states_how_to_install_dask(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    found = wrong(BusConfig(), scheduler="tcp://127.0.0.1:8786")
+    assert found.keys() == {"scheduler"}
+    assert "pip install 'reactorwatch[cluster]'" in found["scheduler"].cure
