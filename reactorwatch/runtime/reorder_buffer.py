@@ -50,6 +50,18 @@ MAX_KEYS = 1000
 """Keys of a stream that are tracked."""
 
 
+class KeyHistory(NamedTuple):
+    """First and last number of the history of a key, and how many messages it has."""
+
+    first: int
+    last: int
+    messages: int
+
+    def is_cut_off(self, begin: int) -> bool:
+        """True if there should be a message between this number, of another key, and the first."""
+        return self.messages > 2 and self.first - begin > 2 * (self.last - self.first) / (self.messages - 1)
+
+
 @dataclass(slots=True)
 class HoldState(Generic[Item]):
     """State of a stream while messages are held back.
@@ -58,7 +70,7 @@ class HoldState(Generic[Item]):
     """
 
     history: dict[int, Item] = field(default_factory=dict)  # published before the subscription, by number
-    history_from: dict[str, int] = field(default_factory=dict)  # first number of the history, by key
+    history_of: dict[str, KeyHistory] = field(default_factory=dict)
     held: dict[int, tuple[int, Item]] = field(default_factory=dict)  # arrival time and message, by number
     held_bytes: int = 0
     newest: int = 0
@@ -73,7 +85,8 @@ class HoldState(Generic[Item]):
         is_new = number not in self.history and len(self.history) < MAX_HELD
         if is_new:
             self.history[number] = item
-            self.history_from[key] = min(self.history_from.get(key, number), number)
+            first, last, count = self.history_of.get(key, (number, number, 0))
+            self.history_of[key] = KeyHistory(min(first, number), max(last, number), count + 1)
         return is_new
 
     @property
@@ -94,13 +107,13 @@ class HoldState(Generic[Item]):
     @property
     def complete_from(self) -> int:
         """First number from which the history holds every key: publishers cache fewer messages of some keys."""
-        return max(self.history_from.values(), default=0)
+        return max((item.first for item in self.history_of.values()), default=0)
 
     @property
     def is_partial(self) -> bool:
-        """True if the history of a key begins more than a row after that of another one, or there is none."""
-        firsts = self.history_from.values()
-        return not self.history or max(firsts) - min(firsts) > 2 * len(firsts)
+        """True if the history of a key begins later than its usual spacing explains, or there is none of any key."""
+        begin = min((item.first for item in self.history_of.values()), default=None)
+        return begin is None or any(item.is_cut_off(begin) for item in self.history_of.values())
 
 
 @dataclass(slots=True, kw_only=True)
