@@ -44,7 +44,7 @@ class Proxy:
     """A relay of TCP between this machine's loopback and a router, which can be interrupted."""
 
     def __init__(self, endpoint: str) -> None:
-        host, port = endpoint.removeprefix("tcp/").rsplit(":", 1)
+        host, port = endpoint.partition("/")[2].rsplit(":", 1)
         self._target = (host, int(port))
         self._port = free_port()
         self.endpoint = f"tcp/127.0.0.1:{self._port}"

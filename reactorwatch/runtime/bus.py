@@ -36,11 +36,14 @@ class SubscribeOptions(TypedDict, total=False):
             that they cache, 0 (the default): none.
         on_history_end: called, from a thread of the bus and between the messages, when the earlier publications have
             all been handed over.
+        late_rows: messages of each signal up to which one that was given up, and arrives after all, is handed over; by
+            default any is. A monitor takes older samples for those of a plant that was restarted.
     """
 
     on_gap: Callable[[Gap], None] | None
     history_s: float
     on_history_end: Callable[[], None] | None
+    late_rows: float
 
 
 class Bus(Protocol):

@@ -57,6 +57,7 @@ class Delivery:
         on_gap: called with messages that never arrived.
         query_stream: returns the messages published in a stream in the last so many seconds, from publishers' caches;
             infinite: all that are there.
+        late_rows: see `SubscribeOptions`.
     """
 
     def __init__(
@@ -64,12 +65,16 @@ class Delivery:
         handler: Callable[[list[Encoded]], None],
         on_gap: Callable[[Gap], None],
         query_stream: Callable[[str, float], Iterable[SequencedMessage]] = lambda _stream, _since_s: (),
+        late_rows: float = inf,
     ) -> None:
         self._handler = handler
         self._on_gap = on_gap
         self._query_stream = query_stream
         self._buffer: ReorderBuffer[Encoded] = ReorderBuffer(
-            await_history=True, size=lambda item: len(item.payload), start_ns=time.monotonic_ns()
+            await_history=True,
+            size=lambda item: len(item.payload),
+            start_ns=time.monotonic_ns(),
+            late_rows=late_rows,
         )
         self._changed = threading.Condition()
         self._closed = threading.Event()
@@ -93,15 +98,16 @@ class Delivery:
             if buffer.due_ns() != previous_due_ns:
                 self._changed.notify()
 
-    def set_last(self, last: SequencedMessage) -> None:
-        """Before `start`: record the last message that a publisher reports for a key."""
+    def set_last(self, last: SequencedMessage, *, is_recent: bool = False) -> None:
+        """Before `start`: record a publisher's last message on a key, and whether the history includes it."""
         with self._changed:
-            self._buffer.set_last(last.publisher, last.stream, last.message.key, last.number)
+            key, number = last.message.key, last.number
+            self._buffer.set_last(last.publisher, last.stream, key, number, is_recent=is_recent)
 
-    def add_history(self, earlier: SequencedMessage) -> None:
-        """Before `start`: add a message that was published before the subscription."""
+    def add_history(self, earlier: SequencedMessage) -> bool:
+        """Before `start`: add a message that was published before the subscription; True if it is new."""
         with self._changed:
-            self._buffer.add_history(
+            return self._buffer.add_history(
                 earlier.publisher, earlier.stream, earlier.message.key, earlier.number, earlier.message
             )
 

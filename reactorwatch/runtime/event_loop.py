@@ -12,6 +12,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from functools import partial
+from math import inf
 from queue import Empty, SimpleQueue
 from types import FrameType
 from typing import TypeAlias, TypeVar
@@ -250,6 +251,7 @@ class EventLoop:
         on_history_end: Callable[[], None] | None = None,
         on_gap: Callable[[Gap, int], list[Publication]] | None = None,
         on_batch: Callable[[list[Encoded], int], list[Publication]] | None = None,
+        late_rows: float = inf,
     ) -> None:
         """Hand messages on these keys to `node.on_message`; to be called once.
 
@@ -262,6 +264,7 @@ class EventLoop:
             on_gap: called with messages that were published and never arrived, and the time.
             on_batch: called instead of `node.on_message`, with messages that have arrived, up to `MAX_BATCH` at a
                 time, and the time.
+            late_rows: see `SubscribeOptions`.
         """
 
         def put_message(message: Encoded) -> None:
@@ -288,6 +291,7 @@ class EventLoop:
                 on_gap=on_gap and partial(put_gap, on_gap),
                 history_s=history_s,
                 on_history_end=on_history_end and partial(self._inbox.put, end_history, (on_history_end,)),
+                late_rows=late_rows,
             )
 
     def call(self, function: Callable[[int], list[Publication]]) -> None:

@@ -333,7 +333,9 @@ def _cluster_settings(folder: Path) -> bytes:
 
     They hold the certificates themselves, as a path would be relative to the folder in which Dask is started.
     """
-    ca, certificate, key = ((folder / name).read_text(encoding="ascii") for name in (CA, CERTIFICATE, KEY))
+    ca, certificate, key = (
+        (folder / name).read_text(encoding="utf-8", errors="replace") for name in (CA, CERTIFICATE, KEY)
+    )
     identity = {"cert": certificate, "key": key}
     tls = {"ca-file": ca, "scheduler": identity, "worker": identity, "client": identity}
     settings = {

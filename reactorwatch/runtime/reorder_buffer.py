@@ -12,7 +12,7 @@ because each key keeps its order; only a key never seen before might still bring
 (`TIMEOUT_NS`). While a key has not reached that far, its recovery may be under way, or it publishes nothing: that is
 waited for longer than Zenoh waits for the answer to a query (`RECOVERY_TIMEOUT_NS`). A repeated number is dropped, and
 so is one from before the first that was released. A message that arrives after it was given up is released at once,
-out of order.
+out of order, unless it is later than its subscriber can use.
 
 A new subscriber queries every publisher for its last number, and perhaps for its history; until that is complete all
 messages are held (`await_history`). It queries again while something is missing (`history_complete`): during a large
@@ -26,6 +26,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import accumulate
+from math import inf
 from typing import Generic, NamedTuple, TypeVar
 
 from reactorwatch.runtime.gap_tracker import GapTracker
@@ -49,6 +50,18 @@ MAX_KEYS = 1000
 """Keys of a stream that are tracked."""
 
 
+class KeyHistory(NamedTuple):
+    """First and last number of the history of a key, and how many messages it has."""
+
+    first: int
+    last: int
+    messages: int
+
+    def is_cut_off(self, begin: int) -> bool:
+        """True if there should be a message between this number, of another key, and the first."""
+        return self.messages > 2 and self.first - begin > 2 * (self.last - self.first) / (self.messages - 1)
+
+
 @dataclass(slots=True)
 class HoldState(Generic[Item]):
     """State of a stream while messages are held back.
@@ -57,7 +70,7 @@ class HoldState(Generic[Item]):
     """
 
     history: dict[int, Item] = field(default_factory=dict)  # published before the subscription, by number
-    history_from: dict[str, int] = field(default_factory=dict)  # first number of the history, by key
+    history_of: dict[str, KeyHistory] = field(default_factory=dict)
     held: dict[int, tuple[int, Item]] = field(default_factory=dict)  # arrival time and message, by number
     held_bytes: int = 0
     newest: int = 0
@@ -67,11 +80,14 @@ class HoldState(Generic[Item]):
     recovered_ns: int = 0  # when a missing message arrived last, or the first one was found missing
     reached: dict[str, int] = field(default_factory=dict)  # newest number by key, unless it is below the expected one
 
-    def add_history(self, key: str, number: int, item: Item) -> None:
-        """Store a message published before the subscription, if there is room."""
-        if len(self.history) < MAX_HELD:
+    def add_history(self, key: str, number: int, item: Item) -> bool:
+        """Store a message published before the subscription, if there is room; True if it is new."""
+        is_new = number not in self.history and len(self.history) < MAX_HELD
+        if is_new:
             self.history[number] = item
-            self.history_from[key] = min(self.history_from.get(key, number), number)
+            first, last, count = self.history_of.get(key, (number, number, 0))
+            self.history_of[key] = KeyHistory(min(first, number), max(last, number), count + 1)
+        return is_new
 
     @property
     def is_full(self) -> bool:
@@ -91,7 +107,13 @@ class HoldState(Generic[Item]):
     @property
     def complete_from(self) -> int:
         """First number from which the history holds every key: publishers cache fewer messages of some keys."""
-        return max(self.history_from.values(), default=0)
+        return max((item.first for item in self.history_of.values()), default=0)
+
+    @property
+    def is_partial(self) -> bool:
+        """True if the history of a key begins later than its usual spacing explains, or there is none of any key."""
+        begin = min((item.first for item in self.history_of.values()), default=None)
+        return begin is None or any(item.is_cut_off(begin) for item in self.history_of.values())
 
 
 @dataclass(slots=True, kw_only=True)
@@ -104,6 +126,7 @@ class StreamState(GapTracker, Generic[Item]):
     stream: str
     first: int = -1  # number of the first message released
     last_before: int = -1  # last number published before the subscription
+    is_recent: bool = False  # it is recent enough to be part of the history
     last_arrival_ns: int = 0
     keys: tuple[str, ...] = ()
     hold: HoldState[Item] | None = None
@@ -183,12 +206,19 @@ class ReorderBuffer(Generic[Item]):
         await_history: hold all messages until `end_history`.
         size: size of a message in bytes; by default 0.
         start_ns: time when the subscription began.
+        late_rows: number of messages of each key of a stream, up to which one that was given up and arrives late is
+            released.
     """
 
     def __init__(
-        self, *, await_history: bool = False, size: Callable[[Item], int] = lambda _: 0, start_ns: int = 0
+        self,
+        *,
+        await_history: bool = False,
+        size: Callable[[Item], int] = lambda _: 0,
+        start_ns: int = 0,
+        late_rows: float = inf,
     ) -> None:
-        self._size = size
+        self._size, self._late_rows = size, late_rows
         self._streams: dict[tuple[int, str], StreamState[Item]] = {}
         self._by_key: dict[str, StreamState[Item]] = {}  # stream that a key's last released message was of
         self._holding: dict[tuple[int, str], StreamState[Item]] = {}  # all streams with held messages; perhaps others
@@ -224,7 +254,7 @@ class ReorderBuffer(Generic[Item]):
             yield item
             return
         if state.expected is not None and number < state.expected:
-            if state.fill(number):
+            if state.fill(number) and state.expected - number <= self._late_rows * max(len(state.keys), 1):
                 yield item  # given up before, and arrived after all
             return
         yield from self._hold(state, number, item, now_ns, last_arrival_ns)
@@ -276,22 +306,30 @@ class ReorderBuffer(Generic[Item]):
             else:
                 hold.due_ns = min(now_ns + POLL_NS, recovery_end_ns)
 
-    def set_last(self, publisher: int, stream: str, key: str, number: int) -> None:
+    def set_last(self, publisher: int, stream: str, key: str, number: int, *, is_recent: bool = False) -> None:
         """Before `end_history`: record the last number that a publisher reports for one of its keys."""
         state = self._stream(publisher, stream)
         state.record_key(key, number)
-        state.last_before = max(state.last_before, number)
+        state.last_before, state.is_recent = max(state.last_before, number), state.is_recent or is_recent
 
-    def add_history(self, publisher: int, stream: str, key: str, number: int, item: Item) -> None:
-        """Before `end_history`: add a message that was published before the subscription."""
-        self._stream(publisher, stream).hold_state().add_history(key, number, item)
+    def add_history(self, publisher: int, stream: str, key: str, number: int, item: Item) -> bool:
+        """Before `end_history`: add a message that was published before the subscription; True if it is new."""
+        return self._stream(publisher, stream).hold_state().add_history(key, number, item)
 
     def history_complete(self) -> bool:
-        """Before `end_history`: True if nothing is missing in the history, nor between it and live messages."""
+        """Before `end_history`: True if nothing is missing in the history, nor between it and live messages.
+
+        The beginning of a key's history may be missing because its publisher caches no more, or because the replies
+        were lost on their way: the latter is assumed.
+        """
         for state in self._streams.values():
             hold = state.hold
-            if hold is None or not hold.history:
+            # a last number that is unknown: the replies with it were lost, too
+            is_unknown = hold is not None and state.last_before < 0 and hold.held and 0 not in hold.held
+            if hold is None or not (hold.history or state.is_recent or is_unknown):
                 continue
+            if hold.is_partial:
+                return False
             first = hold.complete_from
             numbers = {number for number in (*hold.history, *hold.held) if number >= first}
             if len(numbers) <= max(state.last_before, *numbers) - first:

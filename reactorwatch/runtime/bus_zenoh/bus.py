@@ -6,6 +6,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator
+from math import inf
 from typing import Any, Unpack
 
 import structlog
@@ -136,7 +137,7 @@ class ZenohBus:
             for message in messages:
                 handler(message)
 
-        delivery = self._make_delivery(key_expression, handle_each, options.get("on_gap"))
+        delivery = self._make_delivery(key_expression, handle_each, options)
 
         def on_sample(sample: zenoh.Sample) -> None:
             self._sort_out([SampleReader(sample.encoding).read(sample, time.time_ns())], delivery, handle_each)
@@ -153,7 +154,7 @@ class ZenohBus:
         into a channel that one thread empties, in half the time a message. After each batch the thread pauses: under
         load batches get larger, and a single message is not delayed.
         """
-        delivery = self._make_delivery(key_expression, handler, options.get("on_gap"))
+        delivery = self._make_delivery(key_expression, handler, options)
         # The thread holds the channel alone: a subscriber in use cannot be undeclared.
         channel = self._declare_subscriber(key_expression, zenoh.handlers.FifoChannel(5 * MAX_BATCH)).handler
 
@@ -201,15 +202,13 @@ class ZenohBus:
         self._declared.append(self._session.declare_subscriber(zenoh_expression(key_expression), on_sample))
 
     def _make_delivery(
-        self,
-        key_expression: str,
-        handler: Callable[[list[Encoded]], None],
-        on_gap: Callable[[Gap], None] | None,
+        self, key_expression: str, handler: Callable[[list[Encoded]], None], options: SubscribeOptions
     ) -> Delivery | None:
         """Ordered delivery for an expression that matches whole streams; None for another."""
         if not matches_whole_streams(key_expression):
             return None
-        delivery = Delivery(handler, on_gap or _log_gap, self._query_stream)
+        late_rows = options.get("late_rows", inf)
+        delivery = Delivery(handler, options.get("on_gap") or _log_gap, self._query_stream, late_rows)
         self._deliveries.append(delivery)
         if self._config.ca is not None:
             arguments = (delivery, key_expression)
@@ -244,16 +243,20 @@ class ZenohBus:
             is_complete = all_replied
             for last in newest:
                 delivery.set_last(last)
-        started, missing, since_s = time.monotonic(), history_s > 0.0, history_s
-        for _ in range(MAX_QUERIES):
+        if history_s > 0.0:  # half of it: these messages are recent enough for the queries that follow, too
+            for last in self._query_cache(key_expression, f"{LAST};{history_selector(0.5 * history_s)}")[0]:
+                delivery.set_last(last, is_recent=True)
+        started, missing = time.monotonic(), history_s > 0.0
+        for number in range(MAX_QUERIES if missing else 0):
+            # Mostly only a message is missing that was published during the first query.
+            since_s = HEARTBEAT_S if number == 1 and is_complete else history_s
+            selector = history_selector(since_s + time.monotonic() - started)
+            history, is_complete = self._query_cache(key_expression, selector)
+            new = sum([delivery.add_history(earlier) for earlier in history])
+            # What a second query of all does not bring either, publishers do not have.
+            missing = not (is_complete and (delivery.history_complete() or (number > 1 and not new)))
             if not missing:
                 break
-            history, is_complete = self._query_cache(key_expression, history_selector(since_s))
-            for earlier in history:
-                delivery.add_history(earlier)
-            missing = not (is_complete and delivery.history_complete())
-            waited_s = time.monotonic() - started
-            since_s = HEARTBEAT_S + waited_s if is_complete else history_s + waited_s
         if missing or not is_complete:
             log.warning(
                 "publishers did not answer in time; what they published before may be missing", keys=key_expression

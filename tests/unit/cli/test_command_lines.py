@@ -65,9 +65,9 @@ def taken() -> Iterator[int]:
 
 @pytest.fixture(scope="module")
 def whole_site(tmp_path_factory: pytest.TempPathFactory, taken: int) -> Path:
-    """A site of two plants, whose router cannot listen."""
+    """A site of two plants, with members for all, whose router cannot listen."""
     site = tmp_path_factory.mktemp("sites") / "site"
-    make_site(site, ("cstr", "demo"), f"tls/127.0.0.1:{taken}", None, 30.0, datetime.now(UTC))
+    make_site(site, ("cstr", "demo", "*"), f"tls/127.0.0.1:{taken}", None, 30.0, datetime.now(UTC))
     return site
 
 

@@ -1,7 +1,7 @@
 """Messages of a publisher are delivered in order, however late they arrive; lost ones are reported."""
 
 import random
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import pytest
 
@@ -242,6 +242,56 @@ def test_the_history_is_delivered_when_nothing_is_missing_up_to_the_live_message
     order.add_history(1, STREAM, "T", 7, 7)
     assert order.history_complete()
     assert list(order.end_history(0)) == list(range(10))
+
+
+@pytest.mark.parametrize(
+    ("recent", "held", "history", "complete"),
+    [
+        (True, [], {}, False),
+        (False, [], {}, True),
+        (False, [7], {}, False),
+        (False, [0], {}, True),
+        (False, [], {"C": range(0, 60, 2), "T": range(1, 60, 2)}, True),
+        (False, [], {"C": range(0, 60, 2), "T": range(5, 60, 2)}, False),
+        (False, [], {"C": range(60), "alarm": [60]}, True),
+        (False, [], {"C": [*range(20), *range(21, 50)], "model": [20, 50, 80], "T": range(51, 80)}, False),
+    ],
+    ids=[
+        "recent and lost",
+        "long ago",
+        "live and lost",
+        "it has just begun",
+        "two keys by turns",
+        "the begin of a key is lost",
+        "a rare key",
+        "the begin of a key is lost, beside a rare one",
+    ],
+)
+def test_a_history_is_incomplete_where_replies_were_lost_as_a_whole(
+    recent: bool, held: list[int], history: dict[str, Sequence[int]], complete: bool
+) -> None:
+    order = ReorderBuffer[int](await_history=True)
+    if not held:
+        order.set_last(1, STREAM, "C", max([0, *(max(numbers) for numbers in history.values())]), is_recent=recent)
+    fed(order, held, key="C")
+    for key, numbers in history.items():
+        for number in numbers:
+            assert order.add_history(1, STREAM, key, number, number)
+            assert not order.add_history(1, STREAM, key, number, number)
+    assert order.history_complete() == complete
+
+
+@pytest.mark.parametrize(("newest", "late"), [(14, [7]), (15, []), (99, [])])
+def test_what_arrives_later_than_its_subscriber_can_use_is_dropped(newest: int, late: list[int]) -> None:
+    """At most four messages of each of the two keys behind the next one."""
+    order = ReorderBuffer[int](late_rows=4)
+    fed(order, [0], key="C")
+    fed(order, [1], key="T")
+    fed(order, [9], key="C")
+    assert list(order.release_overdue(RECOVERY_TIMEOUT_NS)) == [Gap(STREAM, 1, 2, 8, 7, RECOVERY_TIMEOUT_NS), 9]
+    assert fed(order, range(10, newest + 1)) == list(range(10, newest + 1))
+    assert fed(order, [7], key="C") == late
+    assert fed(order, [7], key="C") == []
 
 
 def test_a_partial_history_of_some_keys_is_delivered_first_and_is_no_gap() -> None:
