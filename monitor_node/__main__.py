@@ -61,6 +61,8 @@ def run(
             make_folder(state, "--state")
         return MonitorNode(config, time.time_ns(), fleet, metrics, token, kinds)
 
+    if fleet.shards is not None:
+        raise InputError("[fleet] shards are placed on a cluster by `reactorwatch monitor`; a monitor has one shard")
     is_single = fleet.plants is None
     kinds = load_kinds(fleet.share_promise(config), fleet)  # errors in the settings are raised before it joins
     if not is_single:

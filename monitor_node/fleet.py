@@ -84,6 +84,10 @@ def shard_of(plant: str, of: int) -> int:
     return int.from_bytes(blake2b(plant.encode(), digest_size=8).digest(), "big") % of + 1
 
 
+_ADDRESS = re.compile(r"(tcp|tls)://([^\s/:\[\]]+|\[[\da-fA-F:.]+\]):[1-9]\d{0,4}")
+"""Address of a Dask scheduler."""
+
+
 class FleetConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Settings of a fleet; those of the monitor apply to each of its plants.
 
@@ -119,9 +123,9 @@ class FleetConfig(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     def __post_init__(self) -> None:
         if self.plants is not None:
             keys.check_plants(self.plants)
-        if self.scheduler is not None and re.fullmatch(r"(tcp|tls)://\S+:\d{1,5}", self.scheduler) is None:
+        if self.scheduler is not None and _ADDRESS.fullmatch(self.scheduler) is None:
             raise ValueError(
-                f"scheduler must be like tls://10.0.0.3:8786 or tcp://127.0.0.1:8786, got {self.scheduler!r}"
+                f"scheduler must be like tls://10.0.0.3:8786 or tcp://127.0.0.1:8786, got {self.scheduler}"
             )
         try:
             parse_shard(self.shard)

@@ -8,8 +8,8 @@ came back without tasks.
 
 Tasks outlive a client that dies: they are wanted by Dask's own client `fire-and-forget`, too. A task's key has the
 plants, the shard and a digest of the settings, so a client that comes back with the same settings submits tasks that
-exist, which does not start them again. Cancelling a task does not stop it where it runs. So shards are ended on the
-workers: those with other settings when a client begins, all of them when it is stopped.
+exist, which does not start them again. Cancelling a task drops it where it waits, and does not stop it where it runs.
+So shards are also ended on the workers: those with other settings when a client begins, all when it is stopped.
 
 Two monitors of a shard never work at the same time for long: the second one waits until the liveliness token of the
 first has disappeared, and then claims the folder of states, which the first one reads before it publishes (see
@@ -18,11 +18,11 @@ first has disappeared, and then claims the folder of states, which the first one
 
 import asyncio
 import time
-from collections.abc import Collection, Mapping
+from collections.abc import Awaitable, Collection, Mapping
 from contextlib import suppress
 from hashlib import blake2b
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import structlog
 
@@ -41,6 +41,8 @@ if TYPE_CHECKING:
     from distributed.security import Security
 
 log = structlog.get_logger()
+
+Answer = TypeVar("Answer")
 
 RESOURCE = "monitor"
 """Dask's name for what a shard takes of a worker."""
@@ -96,9 +98,8 @@ def place(fleet: FleetConfig, bus: BusConfig, settings: Mapping[str, str], stop:
     Raises:
         InputError: Dask is not installed, or the address does not fit the certificates.
     """
-    asyncio.run(
-        _place(str(fleet.scheduler), cluster_security(fleet, bus), f"{RESOURCE} {fleet.plants} ", settings, stop)
-    )
+    beginning = f"{RESOURCE} {bus.endpoint} {fleet.plants} "
+    asyncio.run(_place(str(fleet.scheduler), cluster_security(fleet, bus), beginning, settings, stop))
 
 
 async def _place(
@@ -166,8 +167,11 @@ class _Placement:
             OSError: the connection was lost, or the scheduler does not answer.
         """
         # The first worker of a new scheduler would get all shards, which leave it again one by one, seconds later.
-        with suppress(TimeoutError):
-            await self._client.wait_for_workers(len(self._shards), timeout=CONNECT_WITHIN_S)
+        until_s = time.monotonic() + CONNECT_WITHIN_S
+        while not self._stop.is_set and time.monotonic() < until_s:
+            if len(await self._ask(self._client.nthreads())) >= len(self._shards):
+                break
+            await _wait(self._changed, 0.2)
         await self._end(self._shards)
         while not self._stop.is_set:
             self._changed.clear()
@@ -182,7 +186,6 @@ class _Placement:
                 await self._on_end(key, self._futures.pop(key))
             if self._client.status != "running":
                 raise ConnectionError("the connection was lost")
-        await self._client.cancel(list(self._futures.values()), force=True)  # what waits for a worker
         await self._end(())
 
     def _submit(self, key: str) -> None:
@@ -208,14 +211,14 @@ class _Placement:
             return
         future.release()
         now_s, worker = time.monotonic(), self._places.get(key, "")
-        ran_s, pause_s = now_s - self._due_s[key], self._pause_s[key]
-        self._pause_s[key] = 1.0 if ran_s > 2.0 * LONGEST_PAUSE_S else min(2.0 * pause_s, LONGEST_PAUSE_S)
+        pause_s = 1.0 if now_s - self._due_s[key] > 2.0 * LONGEST_PAUSE_S else self._pause_s[key]
+        self._pause_s[key] = min(2.0 * pause_s, LONGEST_PAUSE_S)
         self._due_s[key] = now_s + pause_s
         log.warning("ended", shard=self._shards[key], worker=worker, again_in_s=pause_s, **about)
 
     async def _look(self) -> None:
         """Log shards that have come to another worker, or wait for one."""
-        by_worker = await asyncio.wait_for(self._client.processing(), CONNECT_WITHIN_S)
+        by_worker = await self._ask(self._client.processing())
         places = {key: worker for worker, keys in by_worker.items() for key in keys}
         for key, shard in self._shards.items():
             place = places.get(key, "")
@@ -229,8 +232,21 @@ class _Placement:
             self._places[key] = place
 
     async def _end(self, but: Collection[str]) -> None:
+        """End the shards of these plants but for some: those that wait for a worker, then those that run."""
+        from distributed import Future
+
+        def waiting(dask_scheduler: Any, beginning: str) -> list[str]:  # pickled by value
+            return [key for key in dask_scheduler.tasks if str(key).startswith(beginning)]
+
+        found = await self._ask(self._client.run_on_scheduler(waiting, beginning=self._beginning))
+        others: list[Future[Any]] = [Future(key, self._client) for key in found if key not in but]
+        await self._client.cancel(others, force=True)
         try:
             ended = self._client.run(end_shards, self._beginning, tuple(but), on_error="ignore")
             await asyncio.wait_for(ended, END_WITHIN_S)
         except TimeoutError:
-            log.warning("a worker does not answer; its monitor ends with it")
+            log.warning("a worker or the scheduler does not answer, and may still run shards", after_s=END_WITHIN_S)
+
+    async def _ask(self, answer: Awaitable[Answer]) -> Answer:
+        """Answer of the scheduler; an OSError if it does not come in time."""
+        return await asyncio.wait_for(answer, CONNECT_WITHIN_S)

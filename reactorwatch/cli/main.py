@@ -21,6 +21,7 @@ from typer.core import TyperGroup
 from reactorwatch.cli import alarm, my_data, my_plant, recordings, site, studies
 from reactorwatch.cli.display import print_lines
 from reactorwatch.cli.option_groups import Command, add_commands
+from reactorwatch.errors import InputError, UnavailableError
 from reactorwatch.runtime.node_main import INTERRUPTED, UNUSABLE, guard, print_error
 from reactorwatch.version import this_build
 
@@ -129,8 +130,10 @@ def run_command(run: Callable[[], int]) -> NoReturn:
         try:
             return run()
         except BaseException as error:
-            # raised within compiled code, an interrupt is the cause of a SystemError
-            if isinstance(error, typer.Abort) or _is_handled(error):
+            # Raised within compiled code, an interrupt is the cause of a SystemError. A file that cannot be finished
+            # after it is said nevertheless.
+            is_reported = isinstance(error, InputError | UnavailableError | OSError)
+            if isinstance(error, typer.Abort) or (_is_handled(error) and not is_reported):
                 clear_interrupt()
                 return INTERRUPTED
             raise

@@ -218,13 +218,14 @@ def place_shards(
     for option, given in needed.items():
         if given is None:
             raise InputError(
-                f"shards on a cluster need {', '.join(needed)}, a folder that all workers see; add {option}"
+                "shards on a cluster need --plants, --shards, --scheduler and --state (a folder that all workers see): "
+                f"add {option}"
             )
     load_kinds(fleet.share_promise(config), fleet)  # errors in the settings are those of this command
     cluster_security(fleet, bus)
 
     def absolute(name: str | None) -> str | None:
-        return str(Path(name).absolute()) if name is not None and Path(name).exists() else name
+        return str(Path(name).absolute()) if name is not None and Path(name).is_file() else name
 
     bus = replace(bus, **{name: absolute(getattr(bus, name)) for name in IDENTITY})
     config = replace(config, process=absolute(config.process))
@@ -233,7 +234,7 @@ def place_shards(
     folder, count = Path(str(fleet.state)).absolute(), int(fleet.shards or 1)
     settings = {}
     for shard in (str(Shard(number, count)) for number in range(1, count + 1)):
-        own = replace(fleet, shard=shard, shards=None, state=str(folder / shard.replace("/", "-of-")))
+        own = replace(fleet, shard=shard, shards=None, identity=None, state=str(folder / shard.replace("/", "-of-")))
         settings[shard] = settings_text({"bus": bus, "monitor": config, "fleet": own, **others})
     with stop_on_signals() as stop:
         place(fleet, bus, settings, stop)

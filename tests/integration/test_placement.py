@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
 
+import msgspec
 import pytest
 
 from benchmarks.soak.site import Lines
@@ -125,6 +126,31 @@ def test_after_a_change_of_the_settings_the_shards_of_a_killed_command_are_repla
         site.start(shards=3)
         others = monitors.wait_for(lambda shards: set(shards) == {"1/3", "2/3", "3/3"})
         assert not set(others.values()) & set(first.values())
+
+
+@pytest.mark.slow
+def test_shards_that_wait_for_a_worker_are_replaced_and_ended_like_those_that_run(
+    bus_config: BusConfig, tmp_path: Path
+) -> None:
+    """One worker for two shards; the settings change, but for their number."""
+    with placed(bus_config, tmp_path, shards=2, workers=1) as (site, monitors):
+        (first,) = monitors.wait_for(lambda shards: len(shards) == 1).items()
+        site.log.wait_for(lambda lines: sum("placed" in line for line in lines) == 2)
+        site.command.kill()
+        site.command.wait()
+        bus = msgspec.structs.replace(bus_config, cache_messages=9999)
+        write_settings(tmp_path / "settings.toml", {"bus": bus, "monitor": QUICK})
+        again, _ = site.start()
+        monitors.wait_for(lambda shards: len(shards) == 1 and first not in shards.items())
+        again.terminate()
+        assert again.wait(START_WITHIN_S) == 0
+        monitors.wait_for(lambda shards: not shards)
+        site.cluster.start_worker()
+        third, log = site.start()
+        assert len(monitors.wait_for(lambda shards: len(shards) == 2)) == 2
+        third.terminate()
+        assert third.wait(START_WITHIN_S) == 0
+        log.close()
 
 
 @pytest.mark.slow

@@ -267,7 +267,7 @@ def test_a_shard_that_is_none(shard: str, monkeypatch: pytest.MonkeyPatch, capsy
         (["--shard", "1/2"], "--shard is a part of the plants that --plants names; give both"),
         (["--plants", "reactor/*", "--plant", "x"], "--plant is for the monitor of one plant"),
         (["--plants", "reactor/*", "--diagnose", "x"], "--diagnose is for the monitor of one plant"),
-        (["--scheduler", "tcp://127.0.0.1:1"], "a folder that all workers see; add --plants"),
+        (["--scheduler", "tcp://127.0.0.1:1"], "--state (a folder that all workers see): add --plants"),
         (["--plants", "reactor/*", "--scheduler", "tcp://127.0.0.1:1"], "add --shards"),
         (["--plants", "reactor/*", "--shards", "5"], "add --scheduler"),
         (["--plants", "reactor/*", "--shards", "5", "--scheduler", "tcp://127.0.0.1:1"], "add --state"),
@@ -275,6 +275,8 @@ def test_a_shard_that_is_none(shard: str, monkeypatch: pytest.MonkeyPatch, capsy
         ([*ON_CLUSTER, "--shards", "0"], "shards must be in [1, 1000], got 0"),
         ([*ON_CLUSTER, "--process", "nowhere"], "nowhere"),
         ([*ON_CLUSTER, "--scheduler", "10.0.0.3"], "scheduler must be like tls://10.0.0.3:8786"),
+        ([*ON_CLUSTER, "--scheduler", "tcp://::8786"], "got tcp://::8786"),
+        ([*ON_CLUSTER, "--scheduler", "tcp://10.0.0.3:0"], "got tcp://10.0.0.3:0"),
         ([*ON_CLUSTER, "--scheduler", "tls://127.0.0.1:1"], "and certificates, of [fleet] identity or [bus], belong"),
     ],
 )

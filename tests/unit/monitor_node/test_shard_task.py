@@ -29,6 +29,16 @@ def test_the_result_has_the_exit_code_and_the_last_line() -> None:
     assert ended == (3, "of it ended")
 
 
+def test_a_full_disk_under_the_log_of_the_worker_ends_no_shard(monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> int:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("os.write", full)
+    code = "import sys; print('last', file=sys.stderr, flush=True); sys.exit(4)"
+    ended = asyncio.run(run_shard("a", ("-c", code), "", version()))
+    assert ended == (4, "last")
+
+
 WAITS_FOR_ITS_PIPE = ("-c", "import sys; print('up', file=sys.stderr, flush=True); sys.stdin.read()")
 
 
@@ -36,11 +46,9 @@ def test_shards_are_ended_by_the_beginning_of_their_keys_but_for_those_to_keep()
     async def run() -> list[bool]:
         keys = ("monitor a/* 1/2 x", "monitor a/* 1/2 y", "monitor b/* 1/2 x")
         tasks = [asyncio.create_task(run_shard(key, WAITS_FOR_ITS_PIPE, "", version())) for key in keys]
-        while True:
-            await end_shards("monitor a/* ", [keys[1]])
-            if tasks[0].done():
-                break
-            await asyncio.sleep(0)  # it has not begun
+        await asyncio.sleep(0)  # they have begun, and no process has started
+        await end_shards("monitor a/* ", [keys[1]])
+        await tasks[0]
         done = [task.done() for task in tasks]
         for task in tasks[1:]:
             task.cancel()  # as when the worker closes
