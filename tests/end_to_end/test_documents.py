@@ -35,10 +35,18 @@ ENGINE = "needs an engine for containers"
 CLUSTER = "needs a cluster"
 REGISTRY = "needs a registry of images"
 INDEX = "needs a package index"
+DASK = "needs a Dask cluster, tests/integration/{} has one"
+DASK_WORKER = "dask worker tls://10.0.0.3:8786 --nthreads 1 --no-nanny --no-dashboard --resources monitor=1"
+PLACE = "reactorwatch monitor --config SITE/fleet/monitor/settings.toml --shards 5 --scheduler tls://10.0.0.3:8786"
+ON_DASK = [
+    "DASK_CONFIG=SITE/fleet/cluster dask scheduler --no-dashboard",
+    f"DASK_CONFIG=SITE/fleet/cluster {DASK_WORKER}",
+]
 OTHERS = "is for several machines, tests/unit/runtime/test_jobs.py has a cluster on loopback"
 NOT_HERE = {
     "docs/dashboards.md": [("rerun run.rrd", SCREEN)],
     "docs/deployment.md": [
+        *((command, DASK.format("test_cluster_identity.py")) for command in ON_DASK),
         ("docker build --target nodes --build-arg COMMIT=$(git rev-parse HEAD) .", ENGINE),
         ("COMMIT=$(git rev-parse HEAD) docker compose build", ENGINE),
         ("docker buildx imagetools inspect --format '{{.Manifest.Digest}}' python:3.13.9-slim-trixie", REGISTRY),
@@ -65,6 +73,15 @@ NOT_HERE = {
         ("cp -r deploy/systemd/reactorwatch-shard@.service.d /etc/systemd/system/", ROOT_ONLY),
         ("systemctl enable --now reactorwatch-shard@1 reactorwatch-shard@2", ROOT_ONLY),
         ("pip install 'reactorwatch[metrics]'", INDEX),
+    ],
+    "docs/fleet.md": [
+        (command, DASK.format("test_placement.py"))
+        for command in (
+            "pip install 'reactorwatch[cluster]'",
+            "cp deploy/dask/dask.yaml SITE/fleet/cluster/",
+            *ON_DASK,
+            f"{PLACE} --state /srv/fleet",
+        )
     ],
     "docs/getting-started.md": [(".venv/bin/rerun runs/demo-…/demo.rrd", SCREEN)],
     "docs/many_files.md": [
