@@ -18,7 +18,6 @@ from monitor_node.config import MonitorConfig
 from monitor_node.core import COMMANDS
 from monitor_node.fleet import ONE_PLANT, FleetConfig, load_kinds, prepare
 from monitor_node.health import NODE
-from monitor_node.ingest.alignment import REMEMBERED
 from monitor_node.node import MonitorNode, instance_token
 from reactorwatch.contract import keys
 from reactorwatch.errors import InputError
@@ -95,10 +94,10 @@ def run(
         else:  # a plant of which no state was stored yet has a history, too
             read_s = (time.time_ns() - begin_ns) / 1e9
             history_s = 0.0 if fleet.state is None else bus_config.history_s + read_s
-        watch(node, bus, stop, history_s, config.reorder_rows)
+        watch(node, bus, stop, history_s)
 
 
-def watch(node: MonitorNode, bus: Bus, stop: StopSignal, history_s: float = 0.0, reorder_rows: int = 8) -> None:
+def watch(node: MonitorNode, bus: Bus, stop: StopSignal, history_s: float = 0.0) -> None:
     """Run a monitor until it is asked to stop."""
     log.info("listening", plants=node.expression)
     loop = EventLoop(
@@ -118,7 +117,7 @@ def watch(node: MonitorNode, bus: Bus, stop: StopSignal, history_s: float = 0.0,
         history_s=history_s,
         on_history_end=node.on_history_end,
         on_batch=on_batch,
-        late_rows=REMEMBERED * reorder_rows,
+        late_rows=node.late_rows,
     )
     loop.subscribe_liveliness(*node.tokens, on_token=node.on_alive)
     loop.accept_commands(*(f"{node.expression}/{keys.COMMAND}/{name}" for name in COMMANDS))

@@ -14,6 +14,7 @@ from monitor_node.core import Monitor
 from monitor_node.diagnosis_worker import DiagnosisWorker
 from monitor_node.fleet import ONE_PLANT, FleetConfig, FleetMonitor, PlantKind, load_kinds, parse_shard
 from monitor_node.health import NODE, OtherMonitors
+from monitor_node.ingest.alignment import REMEMBERED
 from monitor_node.learn.training_diagnosis import read_equations
 from monitor_node.state_files import RESUMED, StateStore
 from reactorwatch.contract import keys
@@ -64,6 +65,7 @@ class MonitorNode(FleetMonitor):
         is_single: True for the monitor of one plant.
         resumed: True if the monitor of one plant resumed from a stored state.
         token: instance token of this node.
+        late_rows: rows up to which a sample may be late; see `SubscribeOptions`.
         preparation: steps that prepare the end of the training and the search for causes; None: there are none left.
     """
 
@@ -79,6 +81,7 @@ class MonitorNode(FleetMonitor):
         self._fleet, self.metrics = fleet, metrics
         self.expression = fleet.plants or f"{keys.ROOT}/{config.plant}"
         self.token = token or instance_token(config, fleet)
+        self.late_rows = REMEMBERED * config.reorder_rows
         self.preparation: Iterator[None] | None = None
         self.resumed = False
         self.is_single = fleet.plants is None

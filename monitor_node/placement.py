@@ -86,6 +86,11 @@ def cluster_security(fleet: FleetConfig, bus: BusConfig) -> "Security | None":
     return Security(tls_ca_file=ca, tls_client_cert=certificate, tls_client_key=key, require_encryption=True)
 
 
+def worker_command(address: str) -> str:
+    """Command that starts a worker for one shard."""
+    return f"dask worker {address} --nthreads 1 --no-nanny --resources {RESOURCE}=1"
+
+
 def place(fleet: FleetConfig, bus: BusConfig, settings: Mapping[str, str], stop: StopSignal) -> None:
     """Keep the shards of a fleet running on a cluster until a stop is requested, which ends them.
 
@@ -227,8 +232,7 @@ class _Placement:
             if place:
                 log.info("placed", shard=shard, worker=place)
             else:
-                cure = f"dask worker {self._address} --nthreads 1 --no-nanny --resources {RESOURCE}=1"
-                log.warning("waiting for a worker", shard=shard, cure=cure)
+                log.warning("waiting for a worker", shard=shard, cure=worker_command(self._address))
             self._places[key] = place
 
     async def _end(self, but: Collection[str]) -> None:

@@ -18,7 +18,7 @@ from reactorwatch.errors import InputError
 from reactorwatch.version import version
 
 
-class Shard:
+class RunningShard:
     """A task of this worker: its monitor's process once it has started, and whether it has to end."""
 
     def __init__(self) -> None:
@@ -33,7 +33,7 @@ class Shard:
             self.process.stdin.close()
 
 
-_running: dict[str, Shard] = {}
+_running: dict[str, RunningShard] = {}
 """Tasks of this worker, by key."""
 
 
@@ -59,7 +59,7 @@ async def run_shard(key: str, arguments: Sequence[str], settings: str, client_ve
     """
     if version() != client_version:
         raise InputError(f"the worker has reactorwatch {version()}, the command {client_version}; install the same")
-    shard = _running[key] = Shard()
+    shard = _running[key] = RunningShard()
     try:
         with TemporaryDirectory(prefix="reactorwatch-") as folder:
             path = Path(folder) / "settings.toml"

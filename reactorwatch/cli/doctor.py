@@ -124,7 +124,7 @@ def _check_dates(what: str, certificate: Certificate, now: datetime) -> Finding:
 
 def check_cluster(fleet: "FleetConfig", bus: BusConfig, now: datetime) -> Iterator[Finding]:
     """Check the Dask cluster of a fleet's shards: which programs may run code there, and the room of its workers."""
-    from monitor_node.placement import RESOURCE, cluster_security
+    from monitor_node.placement import RESOURCE, cluster_security, worker_command
 
     if (address := fleet.scheduler) is None:
         return
@@ -147,9 +147,8 @@ def check_cluster(fleet: "FleetConfig", bus: BusConfig, now: datetime) -> Iterat
         yield Finding("scheduler", f"no way in at {address}: {one_line(error)}", cure)
         return
     shards, room = fleet.shards or 1, sum(item.get(RESOURCE, 0.0) for item in resources)
-    start = f"start more: dask worker {address} --nthreads 1 --no-nanny --resources {RESOURCE}=1"
     found = f"{len(resources)} workers with room for {room:g} shards, for {shards}"
-    yield Finding("workers", found, start if room < shards else "")
+    yield Finding("workers", found, f"start more: {worker_command(address)}" if room < shards else "")
     if lost_s is None or lost_s > LOST_WITHIN_S:
         found = f"removed {'never' if lost_s is None else f'{lost_s:g} s'} after its last answer, and its shards wait"
         cure = f"set distributed.scheduler.worker-ttl to 2s, as {CLUSTER_SETTINGS} does, and restart the scheduler"

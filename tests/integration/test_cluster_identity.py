@@ -81,7 +81,7 @@ def test_plain_tcp_does_not_reach_the_cluster(cluster: Cluster) -> None:
 
 
 def wrong(bus: BusConfig, **settings: Any) -> dict[str, Finding]:
-    """What `doctor` finds wrong, by check."""
+    """Findings of `doctor` that need a cure, by check."""
     fleet, now = FleetConfig(plants="reactor/*", **settings), datetime.datetime.now(datetime.UTC)
     return {finding.check: finding for finding in check_cluster(fleet, bus, now) if finding.cure}
 

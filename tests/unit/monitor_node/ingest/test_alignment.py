@@ -30,6 +30,14 @@ def feed(aligner: Aligner, samples: list[tuple[str, int]]) -> list[Row]:
     return rows
 
 
+def feed_new_run(aligner: Aligner, begin_ns: int, first: int) -> list[Row]:
+    """Three rows of a run that begins at a time, and with a number."""
+    return [
+        row for number in range(3) for signal in SIGNALS
+        for row in aligner.update(signal, begin_ns + number * PERIOD, first + number, 1.0)
+    ]  # fmt: skip
+
+
 def in_order(count: int) -> list[tuple[str, int]]:
     return [(signal, number) for number in range(count) for signal in SIGNALS]
 
@@ -126,10 +134,7 @@ def test_the_same_sample_twice_is_a_duplicate_before_and_after_its_row_left(when
 def test_a_publisher_that_begins_again_begins_a_new_run() -> None:
     aligner = Aligner(SIGNALS, 2)
     feed(aligner, in_order(50))
-    rows = [
-        row for number in range(3) for signal in SIGNALS
-        for row in aligner.update(signal, 10_000 + number * PERIOD, number, 1.0)
-    ]  # fmt: skip
+    rows = feed_new_run(aligner, 10_000, 0)
     assert [row.time_ns for row in rows] == [10_000, 10_100, 10_200]
     assert rows[0].restarted
     assert not rows[1].restarted
@@ -219,10 +224,7 @@ def test_a_step_back_is_a_restart_if_it_is_more_than_four_times_the_reordering(s
 def test_a_small_step_back_at_a_later_time_is_a_restart_if_it_is_to_zero(first: int, restarts: int) -> None:
     aligner = Aligner(SIGNALS, 4)
     feed(aligner, in_order(3))
-    rows = [
-        row for number in range(3) for signal in SIGNALS
-        for row in aligner.update(signal, (10 + number) * PERIOD, first + number, 1.0)
-    ]  # fmt: skip
+    rows = feed_new_run(aligner, 10 * PERIOD, first)
     assert numbers(rows + aligner.flush()) == [10, 11, 12]
     assert aligner.memory.counts.restarts == restarts
     assert aligner.memory.counts.lost == 0
@@ -231,10 +233,7 @@ def test_a_small_step_back_at_a_later_time_is_a_restart_if_it_is_to_zero(first: 
 def test_a_clock_that_is_set_back_starts_a_run_though_the_numbers_continue() -> None:
     aligner = Aligner(SIGNALS, 2)
     feed(aligner, in_order(50))
-    rows = [
-        row for number in range(3) for signal in SIGNALS
-        for row in aligner.update(signal, (10 + number) * PERIOD, 50 + number, 1.0)
-    ]  # fmt: skip
+    rows = feed_new_run(aligner, 10 * PERIOD, 50)
     assert numbers(rows) == [10, 11, 12]
     assert [row.restarted for row in rows] == [True, False, False]
     assert aligner.memory.counts.restarts == 1
