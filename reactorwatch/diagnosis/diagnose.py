@@ -5,21 +5,41 @@ from dataclasses import replace
 from math import inf
 
 import numpy as np
+from msgspec import structs
 
 from reactorwatch.arrays import Array
+from reactorwatch.diagnosis.decide import (
+    LEAST_GAIN,
+    SURE,
+    Found,
+    PlaceFound,
+    decide_without_nuisance,
+    grade_of,
+)
 from reactorwatch.diagnosis.estimates import (
     adjusted_parameters,
-    causes_of,
     convert_to_run_minutes,
     covariances_of,
     extended_model,
+    hypothesis_causes,
     refine_parameters,
 )
 from reactorwatch.diagnosis.experiment.design import propose_experiment
 from reactorwatch.diagnosis.experiment.inputs import check_limits
 from reactorwatch.diagnosis.fitting.colored_noise import Noise, estimate_sensor_noise
 from reactorwatch.diagnosis.fitting.hypothesis import FROM_BEGINNING
+from reactorwatch.diagnosis.graded import (
+    describe_nearest,
+    left_in_tolerances,
+    nearest_of,
+    remaining_of,
+    separate_corrections,
+    weights_of,
+    with_nuisance,
+)
 from reactorwatch.diagnosis.holdout import Errors, evaluate_holdout, is_near_noise
+from reactorwatch.diagnosis.inexact.answer import onset_of
+from reactorwatch.diagnosis.inexact.explain import explain
 from reactorwatch.diagnosis.lasting import LastingResult, prefer_lasting
 from reactorwatch.diagnosis.law.describe import describe_law, law_hypothesis
 from reactorwatch.diagnosis.law.unknown import NOISY_SHARE, Localised, UnknownSearch
@@ -57,16 +77,6 @@ from reactorwatch.process.generic import hidden_sources
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.profiles import CONSTANT, FREE_NAME
 from reactorwatch.records.record import MAX_SPANS, Record
-
-LEAST_GAIN = 10.0
-"""Threshold in BIC to refute the nominal model (Kass & Raftery 1995, J. American Statistical Association 90)."""
-
-SURE = 6.0
-"""Threshold in BIC, odds of twenty to one: alternatives that are worse by less are not ranked."""
-
-MUCH_RESIDUAL, MUCH_RESIDUAL_OF_TWO = 30.0, 10.0
-"""Minus the decimal logarithm of the p-value of whiteness: no right cause leaves so much, nor do two causes, which can
-imitate a third."""
 
 KEPT_BYTES = 31_000_000
 
@@ -118,22 +128,21 @@ def diagnose(
     result = _drop_hidden(search_noise_growth(search, result), hidden)
     best = result.best if result.nominal.bic - result.best.bic >= LEAST_GAIN else result.nominal
     adequacy = minus_log10_p(best.fit.w, run.inputs)
-    verdict = _decide_verdict(result, best)
+    found = _found(result, best, adequacy)
+    verdict = decide_without_nuisance(found, None)
     location = best.hypothesis.filter.effects[0].location if best.label else ""
-    if verdict == UNKNOWN:
-        best = result.nominal
     remarks = [*_describe_record(record), *_describe_outliers(whole, run)]
     unknown: Localised | None = None
-    if verdict == UNKNOWN or np.any(adequacy >= DOUBTFUL) or (best.label and _may_be_unknown(result, best, model)):
-        white = best.label and not np.any(adequacy >= DOUBTFUL) and not _seems_noisy(result, model)
+    if verdict == UNKNOWN or not found.is_white or (best.label and _may_be_unknown(result, best, model)):
+        white = best.label and verdict != UNKNOWN and found.is_white and not _seems_noisy(result, model)
         unknown = unknowns.localise(best.bic if white else np.inf)
-        by_source = verdict == UNKNOWN and not np.any(adequacy >= DOUBTFUL)
-        if verdict == UNKNOWN or _is_unknown(unknown, result, best, run, float(np.max(adequacy))):
-            verdict, best = UNKNOWN, result.nominal
+        by_source = verdict == UNKNOWN and found.is_white
+        verdict = decide_without_nuisance(found, _place_found(unknown, result, best, run, found.minus_log10_p))
+        if verdict == UNKNOWN:
+            best = result.nominal
             if not by_source:
                 location = unknown.location
         elif unknown.gain_over(best) > -SURE and len(best.label) > 1:
-            verdict = AMBIGUOUS
             remarks.append(f"one unknown deviation in {unknown.location} explains the record as well")
         else:
             unknown = None
@@ -176,7 +185,7 @@ def diagnose(
     if unknown is not None and unknown.curve is not None and unknown.location == location:
         curves = replace(curves, unknown=unknown.curve.curve)
     blind = ~np.all(np.isfinite(result.nominal.fit.innovations.prediction), axis=1)
-    causes = convert_to_run_minutes(causes_of(best, covariances), record) if law is None else ()
+    causes = convert_to_run_minutes(hypothesis_causes(best, covariances), record) if law is None else ()
     parameters = adjusted_parameters(run, model, uncertain or {}, best, None if lasting is None else lasting.sds)
     adjusted = model.with_values({name: item.estimate.value for name, item in parameters.items()})
     alternatives = _alternatives(result, best)
@@ -195,7 +204,23 @@ def diagnose(
         else describe_law(adjusted, run, unknown.found, reported, covariances, gain.held_out)
     )
     worse = _locations(best, alternatives) if unknown is None else unknown.locations
-    return Diagnosis(
+    nearest = nearest_of(result, best)
+    weights = weights_of(nearest, result.nominal, run, before, noise_sd)
+    listed = describe_nearest(nearest, weights, run, record)
+    share = weights[0].share if best.label else 0.0
+    causes = weights[0].of(causes) if best.label and law is None else causes
+    shown, corrections = separate_corrections(causes, effects)
+    described_alternatives = [
+        structs.replace(
+            _alternative(search, item, result.noise, best.bic, record),
+            share=weight.share,
+            probability=weight.probability,
+        )
+        for item, weight in zip(
+            alternatives, weights_of(alternatives, result.nominal, run, before, noise_sd), strict=True
+        )
+    ]
+    exact = Diagnosis(
         file=record.name,
         zero=record.zero,
         samples=run.time_min.size,
@@ -203,8 +228,13 @@ def diagnose(
         span_min=record.span_min,
         seconds=0.0,
         verdict=verdict,
-        causes=causes,
-        alternatives=tuple(_alternative(search, item, result.noise, best.bic, record) for item in alternatives),
+        grade=grade_of(verdict, share, left_in_tolerances(gain.held_out, bands)),
+        causes=shown,
+        alternatives=tuple(described_alternatives),
+        nearest=listed,
+        onset=onset_of(causes),
+        nuisance=corrections,
+        remaining=remaining_of(gain.held_out, location if verdict == UNKNOWN else None),
         location=location or None,
         locations=tuple(LocationEvidence(name, bic) for name, bic in worse.items()),
         law=described,
@@ -219,17 +249,56 @@ def diagnose(
         remarks=tuple(remarks),
         curves=curves,
     )
+    if not _calls_for_nuisance(exact, result, best, model):
+        return exact
+    explained = explain(model, effects, run, _starts(run, result.nominal, model), uncertain or {}, smallest_sd)
+    if explained is None:
+        return exact
+    return with_nuisance(exact, explained, model, effects, record, bands, uncertain or {})
 
 
-def _is_unknown(unknown: Localised, result: SearchResult, best: FittedHypothesis, run: Run, log_p: float) -> bool:
-    """Return true if the catalogue, whose best residual is white with this p-value, does not explain the run."""
-    better = unknown.is_better(best)
-    if log_p < WHITE:
-        return better and bool(best.label)
-    if not best.label or log_p >= (MUCH_RESIDUAL if len(best.label) == 1 else MUCH_RESIDUAL_OF_TWO):
-        return True
-    sensor_sd = result.noise.sensor_sd(result.nominal.hypothesis.filter.model.output_names)
-    return better or not is_near_noise(evaluate_holdout(run, result.nominal, best)[1], sensor_sd)
+def _calls_for_nuisance(
+    diagnosis: Diagnosis, result: SearchResult, best: FittedHypothesis, model: ProcessModel
+) -> bool:
+    """True if the hypotheses are to be compared with nuisance: nothing simple explains the record to the noise."""
+    is_white = all(item.minus_log10_p < DOUBTFUL for item in diagnosis.adequacy.values())
+    if diagnosis.verdict == UNKNOWN:
+        return diagnosis.law is None or not is_white
+    is_simple = diagnosis.verdict != AMBIGUOUS and len(best.label) < 2
+    is_simple = is_simple and FREE_NAME not in [profile.name for profile in best.hypothesis.profiles]
+    return not is_simple and (not is_white or _seems_noisy(result, model))
+
+
+def _starts(run: Run, nominal: FittedHypothesis, model: ProcessModel) -> Array:
+    """States at the first row of each part of a run, by the filter, shape (parts, n_x)."""
+    x = nominal.fit.innovations.x[:, : len(model.states)]
+    known = np.flatnonzero(np.all(np.isfinite(x), axis=1))
+    rows = known[np.minimum(np.searchsorted(known, (0, *run.breaks)), known.size - 1)]
+    return np.asarray(x[rows])
+
+
+def _found(result: SearchResult, best: FittedHypothesis, adequacy: Array) -> Found:
+    """What a search found, for `decide`."""
+    others = [item for item in result.hypotheses if item.hypothesis.causes != best.hypothesis.causes]
+    close = [item for item in others if item.bic - best.bic < SURE]
+    return Found(
+        result.nominal.bic - best.bic,
+        bool(close),
+        bool(best.label) and all(_is_source(item) for item in (best, *close)),
+        len(best.label),
+        float(np.max(adequacy)),
+    )
+
+
+def _place_found(
+    unknown: Localised, result: SearchResult, best: FittedHypothesis, run: Run, log_p: float
+) -> PlaceFound:
+    """What a search for an unknown found, for `decide`."""
+    is_near = False
+    if best.label and log_p >= WHITE:
+        sensor_sd = result.noise.sensor_sd(result.nominal.hypothesis.filter.model.output_names)
+        is_near = is_near_noise(evaluate_holdout(run, result.nominal, best)[1], sensor_sd)
+    return PlaceFound(unknown.is_better(best), unknown.gain_over(best), is_near)
 
 
 def _may_be_unknown(result: SearchResult, best: FittedHypothesis, model: ProcessModel) -> bool:
@@ -270,16 +339,6 @@ def _keep_memory() -> None:
     fit. It keeps twice the largest size that it has seen freed, up to 32 MB.
     """
     np.empty(KEPT_BYTES // 8)
-
-
-def _decide_verdict(result: SearchResult, best: FittedHypothesis) -> str:
-    if best is result.nominal:
-        return NOMINAL
-    others = [item for item in result.hypotheses if item.hypothesis.causes != best.hypothesis.causes]
-    close = [item for item in others if item.bic - best.bic < SURE]
-    if all(_is_source(item) for item in (best, *close)):
-        return UNKNOWN
-    return AMBIGUOUS if close else NAMED
 
 
 def _drop_hidden(result: SearchResult, hidden: Sequence[Effect]) -> SearchResult:
@@ -324,7 +383,7 @@ def _noise_sd(result: SearchResult, run: Run, model: ProcessModel, curves: Curve
 def _alternative(search: Search, item: FittedHypothesis, noise: Noise, best_bic: float, record: Record) -> Alternative:
     item.hypothesis.filter.noise = noise
     refined, covariances = refine_parameters(search, item)
-    return Alternative(convert_to_run_minutes(causes_of(refined, covariances), record), item.bic - best_bic)
+    return Alternative(convert_to_run_minutes(hypothesis_causes(refined, covariances), record), item.bic - best_bic)
 
 
 def _gain(model: ProcessModel, delta_bic: float, noise_sd: Array, before: Errors, after: Errors) -> Gain:

@@ -296,7 +296,7 @@ def convert_to_run_minutes(causes: Sequence[Cause], record: Record) -> tuple[Cau
     return tuple(result)
 
 
-def causes_of(best: FittedHypothesis, covariances: Sequence[Array]) -> list[Cause]:
+def hypothesis_causes(best: FittedHypothesis, covariances: Sequence[Array]) -> list[Cause]:
     """Causes of a hypothesis with their estimated parameters.
 
     Args:

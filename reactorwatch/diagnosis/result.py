@@ -1,6 +1,7 @@
 """Result of a diagnosis: its fields are those of `diagnose --json`, but for what only texts and figures need."""
 
 from dataclasses import dataclass, field
+from math import nan
 from typing import Any, ClassVar
 
 import msgspec
@@ -13,6 +14,9 @@ from reactorwatch.process.law import ExtendedLaw
 from reactorwatch.results.base import Result
 
 NOMINAL, NAMED, AMBIGUOUS, UNKNOWN = "nominal", "named", "ambiguous", "unknown"
+
+RIGHT, EXPLAINED, MOSTLY, NEAREST, UNEXPLAINED = "right", "explained", "mostly", "nearest", "unknown"
+"""Grades of a verdict, see `diagnosis.decide`."""
 
 SD_95 = 1.959964
 """Half width of the 95 % interval of a normal distribution, in standard deviations."""
@@ -45,6 +49,10 @@ class Cause(Result, frozen=True, kw_only=True):
         run: number of the run of the record in which it sets in, from 1; None: the record has one.
         parameters: `size` first, then those of the profile; times in minutes of that run.
         run_shift_min: shift from minutes of that run to `Record.continuous_min`.
+        share: share of the squared simulation error beyond noise and nuisance that its explanation removes on held-out
+            rows.
+        probability: probability of that explanation.
+        beside: names of the other causes of that explanation.
     """
 
     cause: str
@@ -54,6 +62,9 @@ class Cause(Result, frozen=True, kw_only=True):
     run: int | None = None
     parameters: dict[str, Estimate]
     run_shift_min: float = 0.0
+    share: float = nan
+    probability: float = nan
+    beside: tuple[str, ...] = ()
 
     python_only: ClassVar = ("run_shift_min",)
 
@@ -97,15 +108,49 @@ class Alternative(Result, frozen=True):
     Attributes:
         explanation: causes of the alternative; `causes` in JSON.
         delta_bic: BIC of the alternative minus that of the named explanation.
+        share: see `Cause`.
+        probability: see `Cause`.
     """
 
     explanation: tuple[Cause, ...] = msgspec.field(name="causes")
     delta_bic: float
+    share: float = nan
+    probability: float = nan
 
     @property
     def causes(self) -> tuple[tuple[str, str], ...]:
         """(cause, profile) of each of its causes."""
         return tuple((item.cause, item.profile) for item in self.explanation)
+
+
+class Nuisance(Result, frozen=True):
+    """What differs a little between plant and model beside the causes.
+
+    Attributes:
+        name: an effect of the catalogue, or `<signal>.delay` (negative: stamped early) or `<signal>.lag`.
+        value: its estimate.
+        prior_sd: standard deviation of its prior; None: it is a small correction that was found without one.
+    """
+
+    name: str
+    value: Estimate
+    prior_sd: float | None
+
+
+class Remaining(Result, frozen=True):
+    """What is left of an output's simulation error.
+
+    Attributes:
+        rmse: root mean square error on held-out rows.
+        noise_sd: standard deviation of the sensor's noise.
+        unit: unit of both.
+        location: location where what is left acts; None: unknown.
+    """
+
+    rmse: float
+    noise_sd: float
+    unit: str
+    location: str | None
 
 
 class LocationEvidence(Result, frozen=True):
@@ -352,8 +397,13 @@ class Diagnosis(Result, frozen=True, kw_only=True):
         span_min: duration from its first row to its last, summed over its runs.
         seconds: duration of the diagnosis; 0: not measured.
         verdict: `nominal`, `named`, `ambiguous` or `unknown`.
+        grade: `right`, `explained`, `mostly`, `nearest` or `unknown`, see `diagnosis.decide`.
         causes: causes that explain the record together; empty if nominal or unknown.
         alternatives: every other explanation within 10 BIC, the best first.
+        nearest: causes of the best five explanations, whatever the verdict.
+        onset: onset of the best explanation that has one.
+        nuisance: what was fitted beside the causes.
+        remaining: what is left, by output.
         location: location of the deviation; None if nominal.
         locations: BIC of each location within `LISTED` over that of the best; empty where causes explain the record.
         law: law of an unknown; None without one.
@@ -376,8 +426,13 @@ class Diagnosis(Result, frozen=True, kw_only=True):
     span_min: float
     seconds: float
     verdict: str
+    grade: str
     causes: tuple[Cause, ...]
     alternatives: tuple[Alternative, ...]
+    nearest: tuple[Cause, ...]
+    onset: Estimate | None
+    nuisance: tuple[Nuisance, ...]
+    remaining: dict[str, Remaining]
     location: str | None
     locations: tuple[LocationEvidence, ...]
     law: Law | None

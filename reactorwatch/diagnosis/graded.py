@@ -1,0 +1,281 @@
+"""Grade a diagnosis: shares and probabilities of its explanations, and those with nuisance in its place."""
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from msgspec import structs
+
+from reactorwatch.arrays import Array
+from reactorwatch.diagnosis.decide import Verdict, decide
+from reactorwatch.diagnosis.estimates import (
+    convert_to_run_minutes,
+    covariances_of,
+    extended_model,
+    hypothesis_causes,
+)
+from reactorwatch.diagnosis.holdout import Errors, rms, simulate_outputs
+from reactorwatch.diagnosis.inexact import answer
+from reactorwatch.diagnosis.inexact.explain import Explained, Explanation
+from reactorwatch.diagnosis.result import (
+    AMBIGUOUS,
+    LISTED,
+    NOMINAL,
+    UNKNOWN,
+    AdjustedParameter,
+    Alternative,
+    Cause,
+    Diagnosis,
+    Gain,
+    HeldOut,
+    Nuisance,
+    Remaining,
+)
+from reactorwatch.diagnosis.run import Run
+from reactorwatch.diagnosis.search.search import FittedHypothesis, SearchResult
+from reactorwatch.process.effect import Effect, ParameterEffect, ParameterShift
+from reactorwatch.process.model import ProcessModel
+from reactorwatch.process.profiles import CONSTANT
+from reactorwatch.records.record import Record
+
+MOST_NEAREST = 5
+"""Number of explanations that are listed, whatever the verdict."""
+
+SMALL = 0.5
+"""Share of its typical size below which a constant deviation beside another cause is a small correction."""
+
+
+class Weight(NamedTuple):
+    """Share of the squared error that an explanation removes, and its probability."""
+
+    share: float
+    probability: float
+
+    def of(self, causes: Sequence[Cause]) -> tuple[Cause, ...]:
+        """The causes of an explanation with this weight."""
+        names = [item.cause for item in causes]
+        return tuple(
+            structs.replace(
+                item,
+                share=self.share,
+                probability=self.probability,
+                beside=tuple(name for name in names if name != item.cause),
+            )
+            for item in causes
+        )
+
+
+def excess(error: Array, noise_sd: Array) -> Array:
+    """Root mean square error beyond the noise, shape (n_y,)."""
+    return np.sqrt(np.maximum(error**2 - noise_sd**2, 0.0))
+
+
+def share_of(before: Array, after: Array, noise_sd: Array) -> float:
+    """Share of the squared errors beyond the noise that an explanation removes; NaN errors diverged."""
+    was, left = (np.sum((excess(item, noise_sd) / noise_sd) ** 2) for item in (before, after))
+    if not np.isfinite(left):
+        return 0.0
+    return 1.0 if not np.isfinite(was) else min(max(1.0 - float(left / was), 0.0), 1.0) if was > 0.0 else 0.0
+
+
+def weights_of(
+    items: Sequence[FittedHypothesis], nominal: FittedHypothesis, run: Run, before: Errors, noise_sd: Array
+) -> list[Weight]:
+    """Weights of hypotheses without nuisance; the squared errors are those on the rows that are held out.
+
+    Args:
+        items: the hypotheses, without the nominal one.
+        nominal: the nominal one.
+        run: the record.
+        before: errors of the nominal model on held-out rows.
+        noise_sd: standard deviation of each sensor's noise, shape (n_y,).
+    """
+    bics = np.array([item.bic for item in (nominal, *items)])
+    likely = np.exp(-0.5 * (bics - bics.min()))
+    result = []
+    for item, probability in zip(items, (likely / likely.sum())[1:].tolist(), strict=True):
+        hypothesis = item.hypothesis
+        simulated = simulate_outputs(run, hypothesis.filter, hypothesis.signals(item.fit), hypothesis.offsets(item.fit))
+        with np.errstate(invalid="ignore"):
+            error = rms(np.where(before.values, run.measured - simulated, np.nan))
+        share = share_of(before.simulation, error, noise_sd)
+        result.append(Weight(share, share**2 * probability))
+    return result
+
+
+def nearest_of(result: SearchResult, best: FittedHypothesis) -> list[FittedHypothesis]:
+    """The best hypothesis of each set of causes, at most `MOST_NEAREST`; the best first if it has causes."""
+    ordered = [best, *result.hypotheses] if best.label else result.hypotheses
+    first: dict[frozenset[str], FittedHypothesis] = {}
+    for item in ordered:
+        first.setdefault(frozenset(item.hypothesis.causes), item)
+    return list(first.values())[:MOST_NEAREST]
+
+
+def describe_nearest(
+    items: Sequence[FittedHypothesis], weights: Sequence[Weight], run: Run, record: Record
+) -> tuple[Cause, ...]:
+    """Causes of the nearest explanations with their weights."""
+    found = list[Cause]()
+    for item, weight in zip(items, weights, strict=True):
+        causes = convert_to_run_minutes(hypothesis_causes(item, covariances_of(run, item)), record)
+        found += weight.of(causes)
+    return tuple(found)
+
+
+def remaining_of(held_out: Mapping[str, HeldOut], location: str | None) -> dict[str, Remaining]:
+    """What is left of the errors, by output."""
+    return {
+        name: Remaining(item.rmse_after, item.noise_sd, item.unit, location if _is_left(item) else None)
+        for name, item in held_out.items()
+    }
+
+
+def _is_left(item: HeldOut) -> bool:
+    """True if more than a tenth of the squared error is no noise."""
+    return not item.rmse_after**2 < 1.1 * item.noise_sd**2
+
+
+def separate_corrections(
+    causes: Sequence[Cause], effects: Sequence[Effect]
+) -> tuple[tuple[Cause, ...], tuple[Nuisance, ...]]:
+    """Causes without the small constant deviations beside them, and these as small corrections."""
+    typical = {effect.name: abs(effect.typical) for effect in effects}
+    small = [
+        item
+        for item in causes
+        if item.profile == CONSTANT.name and abs(item.parameters["size"].value) < SMALL * typical.get(item.cause, 0.0)
+    ]
+    if not small or len(small) == len(causes):
+        return tuple(causes), ()
+    kept = tuple(item for item in causes if item not in small)
+    return kept, tuple(Nuisance(item.cause, item.parameters["size"], None) for item in small)
+
+
+def with_nuisance(
+    exact: Diagnosis,
+    explained: Explained,
+    model: ProcessModel,
+    effects: Sequence[Effect],
+    record: Record,
+    tolerances: Mapping[str, float],
+    uncertain: Mapping[str, float],
+) -> Diagnosis:
+    """A diagnosis with the explanations with nuisance in the place of those without, if these say more.
+
+    Args:
+        exact: diagnosis without nuisance.
+        explained: explanations with nuisance.
+        model: process model of the simulation.
+        effects: effects that may be named.
+        record: the record.
+        tolerances: tolerance of each output, by name.
+        uncertain: standard deviations of parameters.
+    """
+    bands = np.array([tolerances[name] for name in model.output_names])
+    graded = [answer.graded(item, explained, bands) for item in explained.explanations]
+    first = exact.nearest[0].share if exact.causes and exact.nearest else 0.0
+    left = left_in_tolerances(exact.gain.held_out, tolerances)
+    verdict = decide(exact.verdict, first, left, answer.graded(explained.none, explained, bands), graded)
+    nearest = [cause for item in explained.explanations for cause in answer.causes_of(item, explained)[:1]]
+    nearest = list(convert_to_run_minutes(nearest[:MOST_NEAREST], record))
+    if not verdict.with_nuisance:
+        onset = exact.onset or answer.onset_of(nearest)
+        kept = exact.nearest if verdict.verdict != UNKNOWN else tuple(nearest)
+        causes = () if verdict.verdict == UNKNOWN else exact.causes
+        return structs.replace(
+            exact, verdict=verdict.verdict, grade=verdict.grade, nearest=kept, onset=onset, causes=causes
+        )
+    return _answer_with_nuisance(exact, explained, verdict, tuple(nearest), model, effects, record, uncertain)
+
+
+def _answer_with_nuisance(
+    exact: Diagnosis,
+    explained: Explained,
+    verdict: Verdict,
+    nearest: tuple[Cause, ...],
+    model: ProcessModel,
+    effects: Sequence[Effect],
+    record: Record,
+    uncertain: Mapping[str, float],
+) -> Diagnosis:
+    """The diagnosis that the explanations with nuisance give."""
+    is_right = verdict.verdict == NOMINAL
+    best = explained.none if is_right else explained.explanations[0]
+    own = convert_to_run_minutes(answer.causes_of(best, explained), record)
+    causes = own[:1]
+    alternatives = tuple(Alternative((item,), 0.0, best.share, best.probability) for item in own[1:])
+    if verdict.verdict == AMBIGUOUS:
+        alternatives = (*alternatives, *_rivals(best, explained, record))
+    assert exact.curves is not None
+    curves = answer.curves_with(best, explained, exact.curves)
+    held_out = {
+        name: structs.replace(
+            item,
+            rmse_after=float(np.hypot(best.left[index], explained.noise_sd[index])),
+            noise_sd=float(explained.noise_sd[index]),
+        )
+        for index, (name, item) in enumerate(exact.gain.held_out.items())
+    }
+    adjusted = answer.adjusted_model(best, explained, model)
+    lead = 2.0 * (best.log_evidence - explained.none.log_evidence)
+    return structs.replace(
+        exact,
+        verdict=verdict.verdict,
+        grade=verdict.grade,
+        causes=causes,
+        alternatives=alternatives,
+        nearest=nearest,
+        onset=answer.onset_of(causes),
+        nuisance=answer.nuisance_of(best, explained),
+        remaining=remaining_of(held_out, None),
+        location=causes[0].location if causes else None,
+        locations=(),
+        law=None,
+        significant=not is_right,
+        practical=not is_right,
+        gain=Gain(lead, held_out),
+        experiment=None,
+        extended_model=extended_model(adjusted, effects, causes, record.zero_ns),
+        parameters=_parameters(best, explained, model, uncertain),
+        remarks=exact.remarks[:0],
+        curves=curves,
+    )
+
+
+def _rivals(best: Explanation, explained: Explained, record: Record) -> list[Alternative]:
+    """Explanations within `LISTED` of the best."""
+    result = []
+    for item in explained.explanations[1:]:
+        delta = 2.0 * (best.log_evidence - item.log_evidence)
+        if delta < LISTED:
+            causes = convert_to_run_minutes(answer.causes_of(item, explained)[:1], record)
+            result.append(Alternative(causes, delta, item.share, item.probability))
+    return result
+
+
+def _parameters(
+    item: Explanation, explained: Explained, model: ProcessModel, uncertain: Mapping[str, float]
+) -> dict[str, AdjustedParameter]:
+    """Estimates of the uncertain parameters under an explanation."""
+    nuisance, result = explained.nuisance, dict[str, AdjustedParameter]()
+    for index, effect in enumerate(nuisance.simulation.effects, start=nuisance.effects.start):
+        if not isinstance(effect, (ParameterEffect, ParameterShift)) or effect.parameter not in uncertain:
+            continue
+        known = model.parameter(effect.parameter)
+        scale = known.value if isinstance(effect, ParameterEffect) else 1.0
+        eta, sd = float(item.fitted.theta[index]), float(item.fitted.theta_sd[index])
+        stated = uncertain[effect.parameter]
+        result[effect.parameter] = AdjustedParameter(
+            known.value, stated, known.value + scale * eta, abs(scale) * sd, known.unit
+        )
+    return result
+
+
+def left_in_tolerances(held_out: Mapping[str, HeldOut], tolerances: Mapping[str, float]) -> float:
+    """What an explanation leaves beyond the noise, in tolerances, the largest of the outputs."""
+    left = [
+        float(excess(np.array(item.rmse_after), np.array(item.noise_sd))) / tolerances[name]
+        for name, item in held_out.items()
+    ]
+    return max(left) if np.all(np.isfinite(left)) else np.inf

@@ -1,0 +1,1 @@
+"""Explanations of a record by a plant that is never quite its model."""

@@ -1,0 +1,136 @@
+"""What is reported of explanations with nuisance: causes, nuisance, errors, curves and the extended model."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from reactorwatch.arrays import Array
+from reactorwatch.diagnosis.decide import Graded
+from reactorwatch.diagnosis.inexact.explain import Explained, Explanation
+from reactorwatch.diagnosis.inexact.hypotheses import CONSTANT, CURVE, RAMP, STEP
+from reactorwatch.diagnosis.result import Cause, Curves, Estimate, Nuisance
+from reactorwatch.process.effect import ParameterEffect, ParameterShift
+from reactorwatch.process.model import ProcessModel
+
+WORTH = 2.0
+"""Nuisance is reported if it is more than this many of its standard deviations from 0."""
+
+
+def graded(item: Explanation, explained: Explained, tolerances: Array) -> Graded:
+    """What a verdict depends on.
+
+    Args:
+        item: an explanation.
+        explained: all of them.
+        tolerances: tolerance of each output, shape (n_y,).
+    """
+    lead = 2.0 * (item.log_evidence - explained.none.log_evidence)
+    return Graded(lead, item.share, float(np.max(item.left / tolerances)), float(np.max(item.effect_size / tolerances)))
+
+
+def causes_of(item: Explanation, explained: Explained) -> list[Cause]:
+    """The cause of an explanation; then under their own names those that do the same in this record."""
+    if item.effect is None:
+        return []
+    knots, result = explained.courses.knots, list[Cause]()
+    for fitted in (item, *item.same):
+        effect = fitted.effect
+        assert effect is not None  # it is no nuisance alone
+        hypothesis, of_own = fitted.fitted.hypothesis, _own_factor(fitted, explained)
+        parameters = {"size": Estimate(hypothesis.size / of_own, fitted.size_sd / of_own, effect.unit)}
+        if hypothesis.kind in (STEP, RAMP):
+            parameters["onset"] = Estimate(hypothesis.onset, fitted.fitted.onset_sd, "min")
+        if hypothesis.kind == RAMP:
+            parameters["end"] = Estimate(float(explained.courses.time_min[-1]), 0.0, "min")
+        if hypothesis.kind == CURVE:
+            shares = fitted.fitted.curve / hypothesis.size if hypothesis.size else np.zeros(knots.size)
+            parameters |= {f"time_{i}": Estimate(float(t), 0.0, "min") for i, t in enumerate(knots, start=1)}
+            parameters |= {f"value_{i}": Estimate(float(v), 0.0, "1") for i, v in enumerate(shares, start=1)}
+        result.append(
+            Cause(
+                cause=effect.name,
+                profile=hypothesis.kind,
+                label=effect.labels.get(hypothesis.kind, effect.label),
+                location=effect.location,
+                parameters=parameters,
+                share=item.share,
+                probability=item.probability,
+            )
+        )
+    return result
+
+
+def _own_factor(item: Explanation, explained: Explained) -> float:
+    """Value that nuisance gives to the parameter of a cause, over its nominal one: a size is a share of that value."""
+    hypothesis, nuisance = item.fitted.hypothesis, explained.nuisance
+    if hypothesis.kind == CONSTANT or not isinstance(item.effect, ParameterEffect):
+        return 1.0
+    eta = float(item.fitted.theta[nuisance.effects.start + hypothesis.effect])
+    return 1.0 + (-eta if item.effect.is_loss else eta)
+
+
+def nuisance_of(item: Explanation, explained: Explained) -> tuple[Nuisance, ...]:
+    """Nuisance that differs from 0, but for initial states and the times of single moves."""
+    nuisance, fitted = explained.nuisance, item.fitted
+    sds = nuisance.sds(fitted.hypothesis.prior)
+    result = []
+    for index in range(nuisance.effects.start, nuisance.output_lags.stop):
+        if fitted.hypothesis.kind == CONSTANT and index == fitted.hypothesis.effect:
+            continue
+        value, sd = float(fitted.theta[index]), float(fitted.theta_sd[index])
+        if abs(value) <= WORTH * sd:
+            continue
+        is_effect = index < nuisance.effects.stop
+        unit = nuisance.simulation.effects[index - nuisance.effects.start].unit if is_effect else "min"
+        result.append(Nuisance(nuisance.names[index], Estimate(value, sd, unit), float(sds[index])))
+    return tuple(result)
+
+
+def adjusted_model(item: Explanation, explained: Explained, model: ProcessModel) -> ProcessModel:
+    """The model with the nuisance of its parameters in their values."""
+    nuisance, values = explained.nuisance, dict[str, float]()
+    for effect, eta in zip(nuisance.simulation.effects, item.fitted.theta[nuisance.effects].tolist(), strict=True):
+        if not isinstance(effect, (ParameterEffect, ParameterShift)):
+            continue
+        if effect is item.effect and item.fitted.hypothesis.kind == CONSTANT:  # that is the cause
+            continue
+        proportional = effect.proportional if isinstance(effect, ParameterEffect) else ()
+        for name in (effect.parameter, *proportional):
+            known = model.parameter(name)
+            value = values.get(name, known.value)
+            if isinstance(effect, ParameterEffect):
+                value *= 1.0 + (-eta if effect.is_loss else eta)
+            else:
+                value += eta
+            values[name] = min(max(value, known.lower), known.upper)
+    return model.with_values(values)
+
+
+def curves_with(item: Explanation, explained: Explained, curves: Curves) -> Curves:
+    """Curves of an explanation in the place of those without nuisance."""
+    nuisance, fitted = explained.nuisance, item.fitted
+    names = nuisance.simulation.model.output_names
+    after = nuisance.read(fitted.simulated, fitted.theta)
+    residual = np.column_stack([curves.measured[name] for name in names]) - after
+    deviation = dict[str, Array]()
+    if item.effect is not None:
+        if fitted.hypothesis.kind == CONSTANT:
+            deviation[item.effect.name] = np.full(len(after), fitted.hypothesis.size)
+        else:
+            course = fitted.simulated.deviation.value[:, fitted.hypothesis.effect]
+            deviation[item.effect.name] = course - fitted.theta[nuisance.effects][fitted.hypothesis.effect]
+    known = {name: np.full(len(after), item.size_sd) for name in deviation}
+    return replace(
+        curves,
+        simulated_after=dict(zip(names, after.T, strict=True)),
+        residual_after=dict(zip(names, (residual / explained.noise_sd).T, strict=True)),
+        deviation=deviation,
+        deviation_sd=known,
+        unknown=None,
+    )
+
+
+def onset_of(causes: Sequence[Cause]) -> Estimate | None:
+    """Onset of the first cause that has one."""
+    return next((cause.parameters["onset"] for cause in causes if "onset" in cause.parameters), None)

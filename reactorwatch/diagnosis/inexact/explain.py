@@ -1,0 +1,294 @@
+"""Explanations of a record by a plant that is never quite its model, compared with nuisance in each.
+
+A small shift in time colours every residual, so that no cause leaves a white one, although the right cause removes
+nearly all of the squared error. Here each hypothesis has the same nuisance (`nuisance`), and what is left is a coloured
+discrepancy that is the same for all of them (`noise`): a cause that explains nearly everything sets the yardstick for
+the others, and where even the best explains little, differences shrink by themselves. The plant is simulated, not
+filtered, so nothing follows the measurements.
+
+All causes are ranked by the linearised model (`screen`), the best are fitted (`fit`), and the discrepancy is estimated
+again from the residual of the best; the model is then linearised again about its nuisance.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from math import exp
+
+import numpy as np
+from numpy.typing import NDArray
+
+from reactorwatch.arrays import Array
+from reactorwatch.diagnosis.holdout import BLOCK_MIN, EVERY, FEWEST_BLOCKS
+from reactorwatch.diagnosis.inexact.fit import Fitted, Fitter
+from reactorwatch.diagnosis.inexact.hypotheses import CONSTANT, CURVE, NONE, RAMP, STEP, WIDTH, Courses, Hypothesis
+from reactorwatch.diagnosis.inexact.noise import Discrepancy, estimate_discrepancy, white, white_noise_sd
+from reactorwatch.diagnosis.inexact.nuisance import Nuisance
+from reactorwatch.diagnosis.inexact.screen import Screen
+from reactorwatch.diagnosis.inexact.simulation import Deviation, InexactSimulation, ProductForcing, Simulated
+from reactorwatch.diagnosis.run import Run
+from reactorwatch.process.effect import Effect
+from reactorwatch.process.model import ProcessModel
+from reactorwatch.process.signal_effects import InputDelay, InputLag, OutputDelay, OutputLag
+
+ROUNDS = 2
+"""Estimates of the discrepancy."""
+
+FIRST, LAST, A_CAUSE = 2, 7, 2
+"""Hypotheses with a cause that are fitted in each round, in the last one, and of one cause."""
+
+EQUAL = 1.0 - 1e-6
+"""Cosine beyond which the derivatives by two effects are the same: one explanation with two names."""
+
+KNOWN_SHARE = 0.03
+"""Standard deviation of a size, as a share of it, where constants had to be moved by their typical sizes."""
+
+
+@dataclass(frozen=True, eq=False)
+class Explanation:
+    """A cause beside nuisance, or nuisance alone.
+
+    Attributes:
+        effect: the cause; None: none.
+        same: explanations by other effects that do the same in this record.
+        fitted: the fit.
+        size_sd: standard deviation of the size, with what the nuisance leaves open of it.
+        share: share of the squared simulation error beyond noise and nuisance that it removes on held-out rows.
+        probability: probability among all explanations, times what it explains.
+        left: root mean square error on held-out rows beyond the noise, by output, shape (n_y,).
+        effect_size: root mean square difference between simulations with and without it, by output, shape (n_y,).
+    """
+
+    effect: Effect | None
+    same: tuple["Explanation", ...]
+    fitted: Fitted
+    size_sd: float
+    share: float
+    probability: float
+    left: Array
+    effect_size: Array
+
+    @property
+    def log_evidence(self) -> float:
+        """Logarithm of the evidence."""
+        return self.fitted.log_evidence
+
+
+@dataclass(frozen=True, eq=False)
+class Explained:
+    """All explanations of a record.
+
+    Attributes:
+        explanations: those with a cause, the likeliest first.
+        none: nuisance alone.
+        nuisance: layout of the nuisance.
+        courses: courses in time.
+        noise_sd: standard deviation of the white noise of each output, shape (n_y,).
+    """
+
+    explanations: tuple[Explanation, ...]
+    none: Explanation
+    nuisance: Nuisance
+    courses: Courses
+    noise_sd: Array
+
+
+def explain(
+    model: ProcessModel,
+    effects: Sequence[Effect],
+    run: Run,
+    starts: Array,
+    stated: Mapping[str, float],
+    smallest_sd: Sequence[float],
+) -> Explained | None:
+    """Compare all explanations of a run; None where even the model without any cause diverges.
+
+    Args:
+        model: process model of the plant, without priors.
+        effects: effects that may be named.
+        run: the record.
+        starts: usual states at the first row of each part, shape (parts, n_x).
+        stated: standard deviations of parameters, in their units; 0: exact.
+        smallest_sd: lower bound of each sensor's noise.
+    """
+    return _Comparison(model, effects, run, starts, stated, np.asarray(smallest_sd)).run_rounds()
+
+
+class _Comparison:
+    """The rounds of `explain`, whose arguments it takes."""
+
+    def __init__(
+        self,
+        model: ProcessModel,
+        effects: Sequence[Effect],
+        run: Run,
+        starts: Array,
+        stated: Mapping[str, float],
+        smallest_sd: Array,
+    ) -> None:
+        self._run, self._smallest_sd = run, smallest_sd
+        self._simulation = InexactSimulation(model, effects, run, starts[0])
+        self._nuisance = Nuisance(self._simulation, starts, stated)
+        courses = self._courses = Courses(run.time_min, run.period_min)
+        self._causes = self._causes_of_nuisance(effects)
+        self._rows = self._simulation.rows
+        widths = {index: WIDTH * abs(effect.typical) for index, effect in self._causes.items()}
+        self._widths = widths
+        self._fitter = Fitter(self._nuisance, courses, widths, run.measured[self._rows])
+
+    def _causes_of_nuisance(self, effects: Sequence[Effect]) -> dict[int, Effect]:
+        """Effect by the index of the nuisance that does the same, constantly."""
+        nuisance, model = self._nuisance, self._simulation.model
+        result = dict(enumerate(self._simulation.effects, start=nuisance.effects.start))
+        for effect in effects:
+            if isinstance(effect, (InputDelay, InputLag)):
+                first = nuisance.input_delays if isinstance(effect, InputDelay) else nuisance.input_lags
+                result[first.start + model.input_names.index(effect.input)] = effect
+            elif isinstance(effect, (OutputDelay, OutputLag)):
+                first = nuisance.output_delays if isinstance(effect, OutputDelay) else nuisance.output_lags
+                result[first.start + model.output_names.index(effect.output)] = effect
+        return result
+
+    def run_rounds(self) -> Explained | None:
+        """Rank, fit and estimate the discrepancy in turn."""
+        theta = np.zeros(self._nuisance.size)
+        simulated = self._nuisance.simulate(theta)
+        if simulated is None:
+            return None
+        residual = self._fitter.residual(theta, simulated)
+        noise = white(np.maximum(np.sqrt(np.mean(residual**2, axis=0)), self._smallest_sd))
+        for _ in range(ROUNDS):
+            fits = self._fit_best(self._rank(theta, simulated, noise), theta, noise, FIRST, slow_sensors=True)
+            best = max(fits, key=lambda item: item.log_evidence, default=None)
+            if best is None:
+                return None
+            noise = estimate_discrepancy(best.residual, self._smallest_sd)
+            theta = best.theta.copy()
+            if best.hypothesis.kind in (STEP, RAMP):
+                self._courses = replace(self._courses, expected_min=best.hypothesis.onset)
+            if best.hypothesis.kind == CONSTANT:
+                theta[best.hypothesis.effect] = 0.0
+            again = self._nuisance.simulate(theta)
+            if again is None:
+                return None
+            simulated = again
+        fits = self._fit_best(self._rank(theta, simulated, noise), theta, noise, LAST)
+        return self._explained(fits, noise) if any(item.hypothesis.kind == NONE for item in fits) else None
+
+    def _rank(self, theta: Array, simulated: Simulated, noise: Discrepancy) -> list[Hypothesis]:
+        """All hypotheses by the model linearised about a simulation."""
+        sim, nuisance = self._simulation, self._nuisance
+        found = nuisance.linearise(theta, simulated)
+        steps, hats = self._courses.steps(), self._courses.hats()
+        courses = Deviation(np.hstack([steps.mean, hats.mean]), np.hstack([steps.value, hats.value]))
+        starts = np.zeros((len(sim.begins), len(sim.model.states), len(sim.effects) * courses.mean.shape[1]))
+        causes = nuisance.derivatives(theta, found.slopes, starts, ProductForcing(courses))
+        whitened = noise.whiten(self._fitter.residual(theta, simulated))
+        base, causes = (noise.whiten(self._fitter.mask(item)) for item in (found.nuisance, causes))
+        values = whitened.size
+        return Screen(
+            nuisance,
+            self._courses,
+            self._widths,
+            theta,
+            whitened.ravel(),
+            base.reshape(values, -1),
+            causes.reshape(values, len(sim.effects), -1),
+        ).rank()
+
+    def _fit_best(
+        self, ranked: Sequence[Hypothesis], theta: Array, noise: Discrepancy, count: int, *, slow_sensors: bool = False
+    ) -> list[Fitted]:
+        """Fit no cause, and the best hypotheses with one; also from slow sensors, if these are possible."""
+        none = next(item for item in ranked if item.kind == NONE)
+        chosen: dict[tuple[str, int], Hypothesis] = {}
+        for item in ranked:
+            same = sum(index == item.effect for _, index in chosen)
+            if item.kind != NONE and item.cause not in chosen and same < A_CAUSE and len(chosen) < count:
+                chosen[item.cause] = item
+        slow = theta.copy()
+        slow[self._nuisance.output_lags] = self._nuisance.lag_start_min
+        result = []
+        for item in (none, *chosen.values()):
+            starts = [theta, slow] if slow_sensors and item.prior.lam == 1.0 else [theta]
+            fits = [fit for start in starts if (fit := self._fitter.fit(item, start, noise)) is not None]
+            result += [max(fits, key=lambda fit: fit.log_evidence)] if fits else []
+        return result
+
+    def _explained(self, fits: Sequence[Fitted], noise: Discrepancy) -> Explained:
+        """Shares and probabilities of the fits of the last round."""
+        noise_sd = np.maximum(white_noise_sd(self._run.measured, noise), self._smallest_sd)
+        none = next(item for item in fits if item.hypothesis.kind == NONE)
+        top = max(item.log_evidence for item in fits)
+        total = sum(exp(item.log_evidence - top) for item in fits)
+        result: list[Explanation] = []
+        for item in sorted(fits, key=lambda item: -item.log_evidence):
+            hidden = self._held_out(item)
+            left = self._left(item, hidden, noise_sd)
+            before, after = (_excess(each, noise_sd) for each in (self._left(none, hidden, noise_sd), left))
+            share = min(max(1.0 - after / before, 0.0), 1.0) if before > 0.0 else 0.0
+            effect = None if item is none else self._effect(item.hypothesis)
+            prior = item.hypothesis.prior
+            size_sd = float(np.hypot(item.size_sd, KNOWN_SHARE * max(prior.kappa, prior.lam) * item.hypothesis.size))
+            probability = share**2 * exp(item.log_evidence - top) / total
+            result.append(Explanation(effect, (), item, size_sd, share, probability, left, self._effect_size(item)))
+        causes = self._joined([item for item in result if item.effect is not None])
+        alone = next(item for item in result if item.effect is None)
+        return Explained(tuple(causes), alone, self._nuisance, self._courses, noise_sd)
+
+    def _effect(self, hypothesis: Hypothesis) -> Effect:
+        if hypothesis.kind == CONSTANT:
+            return self._causes[hypothesis.effect]
+        return self._simulation.effects[hypothesis.effect]
+
+    def _held_out(self, item: Fitted) -> NDArray[np.bool_]:
+        """Kept rows that are held out; those about the onset are not, because no others determine it."""
+        times = self._run.time_min
+        length_min = min(BLOCK_MIN, self._courses.span_min / FEWEST_BLOCKS)
+        blocks = np.floor((times - times[0]) / length_min)
+        first = EVERY - 1
+        if item.hypothesis.kind in (STEP, RAMP):
+            first -= np.floor((item.hypothesis.onset - times[0]) / length_min) % EVERY == first
+        return np.asarray(blocks % EVERY == first)[self._rows]
+
+    def _left(self, item: Fitted, hidden: NDArray[np.bool_], noise_sd: Array) -> Array:
+        """Root mean square error on held-out rows beyond the noise, by output."""
+        known = np.isfinite(self._run.measured[self._rows][hidden])
+        square = np.sum(item.residual_without(hidden)[hidden] ** 2, axis=0) / np.maximum(known.sum(axis=0), 1)
+        return np.asarray(np.sqrt(np.maximum(square - noise_sd**2, 0.0)))
+
+    def _effect_size(self, item: Fitted) -> Array:
+        """Root mean square difference between the simulations with and without the cause, by output."""
+        theta = item.theta.copy()
+        if item.hypothesis.kind == CONSTANT:
+            theta[item.hypothesis.effect] = 0.0
+        without = self._nuisance.simulate(theta)
+        if without is None:
+            return np.full(item.residual.shape[1], np.inf)
+        difference = self._nuisance.read(item.simulated, item.theta) - self._nuisance.read(without, theta)
+        return np.asarray(np.sqrt(np.mean(difference**2, axis=0)))
+
+    def _joined(self, items: Sequence[Explanation]) -> list[Explanation]:
+        """Explanations by different causes, of which those that do the same are one."""
+        result: list[Explanation] = []
+        for item in items:
+            for number, other in enumerate(result):
+                if item.effect in (other.effect, *(same.effect for same in other.same)):
+                    break
+                if self._does_the_same(item, other):
+                    result[number] = replace(other, same=(*other.same, item))
+                    break
+            else:
+                result.append(item)
+        return result
+
+    def _does_the_same(self, one: Explanation, other: Explanation) -> bool:
+        """True if the two causes change the outputs in the same way, and fit equally well."""
+        if one.fitted.hypothesis.kind != other.fitted.hypothesis.kind or one.fitted.hypothesis.kind == CURVE:
+            return False
+        a, b = (item.fitted.residual.ravel() for item in (one, other))
+        return bool(np.sum((a - b) ** 2) < (1.0 - EQUAL) * np.sum(a**2))
+
+
+def _excess(left: Array, noise_sd: Array) -> float:
+    """Squared error beyond the noise, over that of the noise, summed over the outputs."""
+    return float(np.sum((left / noise_sd) ** 2))

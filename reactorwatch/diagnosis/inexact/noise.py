@@ -1,0 +1,69 @@
+"""Coloured discrepancy of an output: what no hypothesis explains, and the noise of its sensor.
+
+A first-order coloured discrepancy with white noise is an ARMA(1, 1) process, (1 - a L) r = (1 - b L) e, so the filter
+that undoes it makes the residual and its derivatives white at once. The same levels hold for all hypotheses.
+"""
+
+from dataclasses import dataclass
+from math import log, sqrt
+
+import numpy as np
+from scipy.signal import lfilter
+
+from reactorwatch.arrays import Array
+
+POLES = (0.3, 0.6, 0.8, 0.9, 0.95, 0.98, 0.99, 0.995)
+ZEROS = (0.0, 0.3, 0.6, 0.8, 0.9, 0.95)
+"""Values of a and b that are tried; b is less than a: a discrepancy is slower than noise."""
+
+COLOURED = 10.0
+"""Gain of log likelihood beyond which a residual is taken for coloured: odds of 20,000 to one."""
+
+SMALLEST = 1e-12
+
+
+@dataclass(frozen=True, eq=False)
+class Discrepancy:
+    """ARMA(1, 1) of each output: `a`, `b` and the standard deviation of e, each of shape (n_y,)."""
+
+    a: Array
+    b: Array
+    sd: Array
+
+    def whiten(self, values: Array) -> Array:
+        """Whiten residuals or their derivatives, shape (rows, n_y, ...), in the standard deviation of e."""
+        result = np.empty_like(values)
+        for j, (a, b, sd) in enumerate(zip(self.a, self.b, self.sd, strict=True)):
+            result[:, j] = lfilter([1.0, -a], [1.0, -b], values[:, j], axis=0) / sd
+        return result
+
+
+def white(sd: Array) -> Discrepancy:
+    """White noise with these standard deviations."""
+    return Discrepancy(np.zeros(sd.size), np.zeros(sd.size), np.maximum(sd, SMALLEST))
+
+
+def estimate_discrepancy(residual: Array, smallest_sd: Array) -> Discrepancy:
+    """ARMA(1, 1) of residuals, shape (rows, n_y), 0 where not measured, by maximum likelihood over a grid."""
+    found = []
+    for r, least in zip(residual.T, smallest_sd, strict=True):
+        n = max(int(np.count_nonzero(r)), 1)
+        best = (0.0, 0.0, max(sqrt(float(r @ r) / n), float(least)))
+        loss = n * log(best[2]) - COLOURED
+        for a in POLES:
+            for b in (item for item in ZEROS if item < a):
+                e = lfilter([1.0, -a], [1.0, -b], r)
+                sd = max(sqrt(float(e @ e) / n), float(least))
+                if n * log(sd) < loss:
+                    best, loss = (a, b, sd), n * log(sd)
+        found.append(best)
+    a, b, sd = np.array(found).T
+    return Discrepancy(a, b, sd)
+
+
+def white_noise_sd(measured: Array, discrepancy: Discrepancy) -> Array:
+    """Standard deviation of the white noise of each output: from its second differences, or e where that is smaller."""
+    second = measured[2:] - 2.0 * measured[1:-1] + measured[:-2]
+    with np.errstate(invalid="ignore"):
+        sd = np.sqrt(np.nanmean(second**2, axis=0) / 6.0)
+    return np.asarray(np.fmin(sd, discrepancy.sd))
