@@ -5,8 +5,9 @@
 | no explanation is better than the simulation as it is by `LEAST_GAIN` | nominal | right |
 | only unmodelled sources explain it, or a place explains it better than the catalogue | unknown | see below |
 | with nuisance, no cause is better than none by `LEAST_GAIN` | nominal | right |
-| with nuisance, what is left without a cause is within the tolerance, and the cause changes the outputs by less than \
-half of it or removes less than 0.8 | nominal | right |
+| with nuisance, what is left without a cause is within the tolerance, and the cause is there from the beginning, \
+changes the outputs by less than half of it or removes less than 0.8 | nominal | right |
+| a law explains it, and nuisance alone leaves more than 0.3 of the tolerance | unknown | see below |
 | the best cause with nuisance removes at least half | named, or ambiguous | explained or mostly |
 | otherwise, without nuisance | named, or ambiguous with a rival within `SURE` | explained or mostly |
 
@@ -43,6 +44,9 @@ imitate a third."""
 
 EXPLAINS, MOST, SOME = 0.95, 0.5, 0.1
 """Shares of the squared error from which on a cause explains a record, explains most of it, or is worth naming."""
+
+SMALL_LEFT = 0.3
+"""What nuisance may leave of the tolerance to be preferred to a law."""
 
 SMALL_EFFECT, LARGE_SHARE = 0.5, 0.8
 """A record within the tolerance without any cause is right, unless a cause changes the outputs by the first of these,
@@ -94,12 +98,14 @@ class Graded(NamedTuple):
         share: share of the squared error that it removes.
         left: what it leaves beyond the noise, in tolerances, the largest of the outputs.
         effect: how much the cause changes an output, in tolerances, the largest of the outputs.
+        is_constant: whether the cause is there from the first row to the last.
     """
 
     lead: float
     share: float
     left: float
     effect: float
+    is_constant: bool
 
 
 class Verdict(NamedTuple):
@@ -149,7 +155,9 @@ def grade_of(verdict: str, share: float, left: float) -> str:
     return EXPLAINED if share >= EXPLAINS or left <= 1.0 else MOSTLY
 
 
-def decide(verdict: str, share: float, left: float, none: Graded | None, graded: Sequence[Graded]) -> Verdict:
+def decide(
+    verdict: str, share: float, left: float, none: Graded | None, graded: Sequence[Graded], *, is_law: bool = False
+) -> Verdict:
     """Verdict and grade.
 
     Args:
@@ -158,13 +166,17 @@ def decide(verdict: str, share: float, left: float, none: Graded | None, graded:
         left: what that leaves, in tolerances.
         none: nuisance alone; None: the hypotheses were not compared with nuisance.
         graded: explanations with nuisance, the likeliest first.
+        is_law: whether a law explains the unknown.
     """
     if none is None or not graded:
         return Verdict(verdict, grade_of(verdict, share, left))
     best = graded[0]
-    is_small = none.left <= 1.0 and (best.effect < SMALL_EFFECT or best.share < LARGE_SHARE)
-    if best.lead < LEAST_GAIN or is_small:
+    is_small = best.is_constant or best.effect < SMALL_EFFECT or best.share < LARGE_SHARE
+    is_right = best.lead < LEAST_GAIN or (none.left <= 1.0 and is_small)
+    if is_right and (none.left <= SMALL_LEFT or not is_law):
         return Verdict(NOMINAL, RIGHT, with_nuisance=True)
+    if is_law:
+        return Verdict(verdict, grade_of(verdict, max(item.share for item in graded), left))
     if best.share >= MOST:
         rivals = [item for item in graded[1:] if best.lead - item.lead < LISTED and item.share >= MOST]
         named = AMBIGUOUS if rivals else NAMED

@@ -30,6 +30,7 @@ from reactorwatch.diagnosis.fitting.colored_noise import Noise, estimate_sensor_
 from reactorwatch.diagnosis.fitting.hypothesis import FROM_BEGINNING
 from reactorwatch.diagnosis.graded import (
     describe_nearest,
+    effect_sizes,
     left_in_tolerances,
     nearest_of,
     remaining_of,
@@ -60,11 +61,13 @@ from reactorwatch.diagnosis.result import (
     UNKNOWN,
     Adequacy,
     Alternative,
+    Cause,
     Curves,
     Diagnosis,
     Gain,
     HeldOut,
     LocationEvidence,
+    Nuisance,
 )
 from reactorwatch.diagnosis.run import Run
 from reactorwatch.diagnosis.search.noise import search_noise_growth, search_single_cause
@@ -76,7 +79,10 @@ from reactorwatch.process.effect import TIMING, Effect
 from reactorwatch.process.generic import hidden_sources
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.profiles import CONSTANT, FREE_NAME
+from reactorwatch.process.signal_effects import InputDelay, InputLag, OutputDelay, OutputLag
 from reactorwatch.records.record import MAX_SPANS, Record
+
+TIMES = (InputDelay, InputLag, OutputDelay, OutputLag)
 
 KEPT_BYTES = 31_000_000
 
@@ -204,12 +210,23 @@ def diagnose(
         else describe_law(adjusted, run, unknown.found, reported, covariances, gain.held_out)
     )
     worse = _locations(best, alternatives) if unknown is None else unknown.locations
-    nearest = nearest_of(result, best)
+    bands_of_outputs = np.array([bands[name] for name in model.output_names])
+    nearest = nearest_of(result, best if law is None else result.nominal)
     weights = weights_of(nearest, result.nominal, run, before, noise_sd)
     listed = describe_nearest(nearest, weights, run, record)
-    share = weights[0].share if best.label else 0.0
-    causes = weights[0].of(causes) if best.label and law is None else causes
-    shown, corrections = separate_corrections(causes, effects)
+    share = weights[0].share if weights else 0.0
+    shown, corrections = tuple(causes), tuple[Nuisance, ...]()
+    if causes:
+        causes = weights[0].of(causes)
+        shown, corrections = separate_corrections(causes, effect_sizes(best, run, bands_of_outputs), effects)
+    if verdict == AMBIGUOUS and corrections:
+        names = {item.cause for item in shown}
+        alternatives = [
+            item
+            for item in alternatives
+            if {each.cause for each in _main_causes(item, run, record, bands_of_outputs, effects)} != names
+        ]
+        verdict = AMBIGUOUS if any(item.bic - best.bic < SURE for item in alternatives) else NAMED
     described_alternatives = [
         structs.replace(
             _alternative(search, item, result.noise, best.bic, record),
@@ -261,12 +278,16 @@ def _calls_for_nuisance(
     diagnosis: Diagnosis, result: SearchResult, best: FittedHypothesis, model: ProcessModel
 ) -> bool:
     """True if the hypotheses are to be compared with nuisance: nothing simple explains the record to the noise."""
-    is_white = all(item.minus_log10_p < DOUBTFUL for item in diagnosis.adequacy.values())
     if diagnosis.verdict == UNKNOWN:
-        return diagnosis.law is None or not is_white
-    is_simple = diagnosis.verdict != AMBIGUOUS and len(best.label) < 2
-    is_simple = is_simple and FREE_NAME not in [profile.name for profile in best.hypothesis.profiles]
-    return not is_simple and (not is_white or _seems_noisy(result, model))
+        return True
+    is_white = all(item.minus_log10_p < DOUBTFUL for item in diagnosis.adequacy.values())
+    is_pair = len(best.label) > 1
+    is_simple = not is_pair and FREE_NAME not in [profile.name for profile in best.hypothesis.profiles]
+    if is_pair and all(isinstance(effect, TIMES) for effect in best.hypothesis.filter.effects):
+        return True  # clocks and sensors are a little late everywhere
+    if is_white:
+        return not is_simple and _seems_noisy(result, model)
+    return not is_simple or diagnosis.verdict == AMBIGUOUS
 
 
 def _starts(run: Run, nominal: FittedHypothesis, model: ProcessModel) -> Array:
@@ -275,6 +296,14 @@ def _starts(run: Run, nominal: FittedHypothesis, model: ProcessModel) -> Array:
     known = np.flatnonzero(np.all(np.isfinite(x), axis=1))
     rows = known[np.minimum(np.searchsorted(known, (0, *run.breaks)), known.size - 1)]
     return np.asarray(x[rows])
+
+
+def _main_causes(
+    item: FittedHypothesis, run: Run, record: Record, tolerances: Array, effects: Sequence[Effect]
+) -> tuple[Cause, ...]:
+    """Causes of a hypothesis without small corrections."""
+    causes = convert_to_run_minutes(hypothesis_causes(item, covariances_of(run, item)), record)
+    return separate_corrections(causes, effect_sizes(item, run, tolerances), effects)[0]
 
 
 def _found(result: SearchResult, best: FittedHypothesis, adequacy: Array) -> Found:

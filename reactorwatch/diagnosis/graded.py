@@ -41,8 +41,9 @@ from reactorwatch.records.record import Record
 MOST_NEAREST = 5
 """Number of explanations that are listed, whatever the verdict."""
 
-SMALL = 0.5
-"""Share of its typical size below which a constant deviation beside another cause is a small correction."""
+SMALL = 1.1
+"""Share of its typical size below which a constant deviation beside a cause with a larger effect is a small correction:
+data sheets and constants of the literature are no better than a typical size."""
 
 
 class Weight(NamedTuple):
@@ -136,19 +137,40 @@ def _is_left(item: HeldOut) -> bool:
     return not item.rmse_after**2 < 1.1 * item.noise_sd**2
 
 
+def effect_sizes(item: FittedHypothesis, run: Run, tolerances: Array) -> list[float]:
+    """Root mean square difference that each cause of a hypothesis makes, in tolerances, the largest of the outputs."""
+    hypothesis, signals = item.hypothesis, item.hypothesis.signals(item.fit)
+    if len(signals) < 2:
+        return [np.inf] * len(signals)
+    offsets = hypothesis.offsets(item.fit)
+    whole, result = simulate_outputs(run, hypothesis.filter, signals, offsets), list[float]()
+    for index, effect in enumerate(hypothesis.filter.effects):
+        nothing = np.full(run.time_min.size, effect.neutral)
+        neutral = list(signals)
+        neutral[index] = signals[index]._replace(interval_mean=nothing, sample_value=nothing)
+        without = simulate_outputs(run, hypothesis.filter, neutral, offsets)
+        result.append(float(np.nan_to_num(np.max(rms(whole - without) / tolerances), nan=np.inf)))
+    return result
+
+
 def separate_corrections(
-    causes: Sequence[Cause], effects: Sequence[Effect]
+    causes: Sequence[Cause], sizes: Sequence[float], effects: Sequence[Effect]
 ) -> tuple[tuple[Cause, ...], tuple[Nuisance, ...]]:
-    """Causes without the small constant deviations beside them, and these as small corrections."""
+    """Causes by their effect on the outputs, the largest first, and small constant deviations beside them.
+
+    Args:
+        causes: causes of an explanation.
+        sizes: effect of each on the outputs.
+        effects: the catalogue.
+    """
     typical = {effect.name: abs(effect.typical) for effect in effects}
+    ordered = [item for _, item in sorted(zip(sizes, causes, strict=True), key=lambda pair: -pair[0])]
     small = [
         item
-        for item in causes
+        for item in ordered[1:]
         if item.profile == CONSTANT.name and abs(item.parameters["size"].value) < SMALL * typical.get(item.cause, 0.0)
     ]
-    if not small or len(small) == len(causes):
-        return tuple(causes), ()
-    kept = tuple(item for item in causes if item not in small)
+    kept = tuple(item for item in ordered if item not in small)
     return kept, tuple(Nuisance(item.cause, item.parameters["size"], None) for item in small)
 
 
@@ -176,7 +198,8 @@ def with_nuisance(
     graded = [answer.graded(item, explained, bands) for item in explained.explanations]
     first = exact.nearest[0].share if exact.causes and exact.nearest else 0.0
     left = left_in_tolerances(exact.gain.held_out, tolerances)
-    verdict = decide(exact.verdict, first, left, answer.graded(explained.none, explained, bands), graded)
+    none = answer.graded(explained.none, explained, bands)
+    verdict = decide(exact.verdict, first, left, none, graded, is_law=exact.law is not None)
     nearest = [cause for item in explained.explanations for cause in answer.causes_of(item, explained)[:1]]
     nearest = list(convert_to_run_minutes(nearest[:MOST_NEAREST], record))
     if not verdict.with_nuisance:

@@ -26,7 +26,8 @@ def graded(item: Explanation, explained: Explained, tolerances: Array) -> Graded
         tolerances: tolerance of each output, shape (n_y,).
     """
     lead = 2.0 * (item.log_evidence - explained.none.log_evidence)
-    return Graded(lead, item.share, float(np.max(item.left / tolerances)), float(np.max(item.effect_size / tolerances)))
+    left, effect = (float(np.max(each / tolerances)) for each in (item.left, item.effect_size))
+    return Graded(lead, item.share, left, effect, item.fitted.hypothesis.kind == CONSTANT)
 
 
 def causes_of(item: Explanation, explained: Explained) -> list[Cause]:

@@ -100,7 +100,7 @@ def explain(
     stated: Mapping[str, float],
     smallest_sd: Sequence[float],
 ) -> Explained | None:
-    """Compare all explanations of a run; None where even the model without any cause diverges.
+    """Compare all explanations of a run; None without any, or where even the model without a cause diverges.
 
     Args:
         model: process model of the plant, without priors.
@@ -152,7 +152,7 @@ class _Comparison:
         """Rank, fit and estimate the discrepancy in turn."""
         theta = np.zeros(self._nuisance.size)
         simulated = self._nuisance.simulate(theta)
-        if simulated is None:
+        if simulated is None or not self._simulation.effects:
             return None
         residual = self._fitter.residual(theta, simulated)
         noise = white(np.maximum(np.sqrt(np.mean(residual**2, axis=0)), self._smallest_sd))

@@ -16,8 +16,10 @@ from reactorwatch.diagnosis.inexact.simulation import Deviation
 ONSETS, KNOTS = 24, 25
 """Onsets at which a step or a ramp is tried, and knots of a curve, over the record."""
 
-NEAR_ROWS = np.array([-3.0, -1.0, -0.5, 0.0, 0.5, 1.0, 3.0])
-"""Onsets in rows about the expected one: a step a row late costs more than the right cause gains over others."""
+_ROWS = np.array([0.5, 1.0, 2.0, 3.0, 5.0, 8.0, 12.0, 18.0, 25.0])
+NEAR_ROWS = np.concatenate([-_ROWS[::-1], [0.0], _ROWS])
+"""Onsets in rows about the expected one: a step a row late costs more than the right cause gains over others, and the
+derivative by the onset of a sensor's step sees no further than a row."""
 
 WIDTH = 10.0
 """Standard deviation of a size's prior, in typical sizes."""
