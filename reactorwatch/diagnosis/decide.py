@@ -7,7 +7,8 @@
 | with nuisance, no cause is better than none by `LEAST_GAIN` | nominal | right |
 | with nuisance, what is left without a cause is within the tolerance, and the cause is there from the beginning, \
 changes the outputs by less than half of it or removes less than 0.8 | nominal | right |
-| a law explains it, and nuisance alone leaves more than 0.3 of the tolerance | unknown | see below |
+| a law explains it, nuisance alone leaves more than 0.3 of the tolerance, and no cause but a curve removes 95 % | \
+unknown | see below |
 | the best cause with nuisance removes at least half | named, or ambiguous | explained or mostly |
 | otherwise, without nuisance | named, or ambiguous with a rival within `SURE` | explained or mostly |
 
@@ -31,6 +32,7 @@ from reactorwatch.diagnosis.result import (
     UNKNOWN,
 )
 from reactorwatch.diagnosis.whiteness import DOUBTFUL, WHITE
+from reactorwatch.process.profiles import CONSTANT, FREE_NAME
 
 LEAST_GAIN = 10.0
 """Threshold in BIC to refute the nominal model (Kass & Raftery 1995, J. American Statistical Association 90)."""
@@ -98,14 +100,14 @@ class Graded(NamedTuple):
         share: share of the squared error that it removes.
         left: what it leaves beyond the noise, in tolerances, the largest of the outputs.
         effect: how much the cause changes an output, in tolerances, the largest of the outputs.
-        is_constant: whether the cause is there from the first row to the last.
+        profile: profile of the cause in time; of nuisance alone `constant`.
     """
 
     lead: float
     share: float
     left: float
     effect: float
-    is_constant: bool
+    profile: str
 
 
 class Verdict(NamedTuple):
@@ -171,11 +173,11 @@ def decide(
     if none is None or not graded:
         return Verdict(verdict, grade_of(verdict, share, left))
     best = graded[0]
-    is_small = best.is_constant or best.effect < SMALL_EFFECT or best.share < LARGE_SHARE
+    is_small = best.profile == CONSTANT.name or best.effect < SMALL_EFFECT or best.share < LARGE_SHARE
     is_right = best.lead < LEAST_GAIN or (none.left <= 1.0 and is_small)
     if is_right and (none.left <= SMALL_LEFT or not is_law):
         return Verdict(NOMINAL, RIGHT, with_nuisance=True)
-    if is_law:
+    if is_law and (best.share < EXPLAINS or best.profile == FREE_NAME):
         return Verdict(verdict, grade_of(verdict, max(item.share for item in graded), left))
     if best.share >= MOST:
         rivals = [item for item in graded[1:] if best.lead - item.lead < LISTED and item.share >= MOST]

@@ -29,9 +29,10 @@ from reactorwatch.diagnosis.experiment.inputs import check_limits
 from reactorwatch.diagnosis.fitting.colored_noise import Noise, estimate_sensor_noise
 from reactorwatch.diagnosis.fitting.hypothesis import FROM_BEGINNING
 from reactorwatch.diagnosis.graded import (
-    describe_nearest,
     effect_sizes,
     left_in_tolerances,
+    list_causes,
+    main_causes,
     nearest_of,
     remaining_of,
     separate_corrections,
@@ -210,21 +211,21 @@ def diagnose(
         else describe_law(adjusted, run, unknown.found, reported, covariances, gain.held_out)
     )
     worse = _locations(best, alternatives) if unknown is None else unknown.locations
-    bands_of_outputs = np.array([bands[name] for name in model.output_names])
+    tolerated = np.array([bands[name] for name in model.output_names])
     nearest = nearest_of(result, best if law is None else result.nominal)
     weights = weights_of(nearest, result.nominal, run, before, noise_sd)
-    listed = describe_nearest(nearest, weights, run, record)
+    listed = list_causes([main_causes(item, run, record, tolerated, effects) for item in nearest], weights)
     share = weights[0].share if weights else 0.0
     shown, corrections = tuple(causes), tuple[Nuisance, ...]()
     if causes:
         causes = weights[0].of(causes)
-        shown, corrections = separate_corrections(causes, effect_sizes(best, run, bands_of_outputs), effects)
+        shown, corrections = separate_corrections(causes, effect_sizes(best, run, tolerated), effects)
     if verdict == AMBIGUOUS and corrections:
         names = {item.cause for item in shown}
         alternatives = [
             item
             for item in alternatives
-            if {each.cause for each in _main_causes(item, run, record, bands_of_outputs, effects)} != names
+            if {each.cause for each in main_causes(item, run, record, tolerated, effects)} != names
         ]
         verdict = AMBIGUOUS if any(item.bic - best.bic < SURE for item in alternatives) else NAMED
     described_alternatives = [
@@ -298,14 +299,6 @@ def _starts(run: Run, nominal: FittedHypothesis, model: ProcessModel) -> Array:
     return np.asarray(x[rows])
 
 
-def _main_causes(
-    item: FittedHypothesis, run: Run, record: Record, tolerances: Array, effects: Sequence[Effect]
-) -> tuple[Cause, ...]:
-    """Causes of a hypothesis without small corrections."""
-    causes = convert_to_run_minutes(hypothesis_causes(item, covariances_of(run, item)), record)
-    return separate_corrections(causes, effect_sizes(item, run, tolerances), effects)[0]
-
-
 def _found(result: SearchResult, best: FittedHypothesis, adequacy: Array) -> Found:
     """What a search found, for `decide`."""
     others = [item for item in result.hypotheses if item.hypothesis.causes != best.hypothesis.causes]
@@ -313,8 +306,8 @@ def _found(result: SearchResult, best: FittedHypothesis, adequacy: Array) -> Fou
     return Found(
         result.nominal.bic - best.bic,
         bool(close),
-        bool(best.label) and all(_is_source(item) for item in (best, *close)),
-        len(best.label),
+        bool(best.hypothesis.causes) and all(_is_source(item) for item in (best, *close)),
+        len(best.hypothesis.causes),
         float(np.max(adequacy)),
     )
 

@@ -113,15 +113,20 @@ def nearest_of(result: SearchResult, best: FittedHypothesis) -> list[FittedHypot
     return list(first.values())[:MOST_NEAREST]
 
 
-def describe_nearest(
-    items: Sequence[FittedHypothesis], weights: Sequence[Weight], run: Run, record: Record
+def main_causes(
+    item: FittedHypothesis, run: Run, record: Record, tolerances: Array, effects: Sequence[Effect]
 ) -> tuple[Cause, ...]:
-    """Causes of the nearest explanations with their weights."""
-    found = list[Cause]()
-    for item, weight in zip(items, weights, strict=True):
-        causes = convert_to_run_minutes(hypothesis_causes(item, covariances_of(run, item)), record)
-        found += weight.of(causes)
-    return tuple(found)
+    """Causes of a hypothesis without small corrections, that with the largest effect first."""
+    causes = convert_to_run_minutes(hypothesis_causes(item, covariances_of(run, item)), record)
+    return separate_corrections(causes, effect_sizes(item, run, tolerances), effects)[0]
+
+
+def list_causes(explanations: Sequence[tuple[Cause, ...]], weights: Sequence[Weight]) -> tuple[Cause, ...]:
+    """Causes of explanations with their weights; those that differ in small corrections only are listed once."""
+    found = dict[frozenset[str], tuple[Cause, ...]]()
+    for causes, weight in zip(explanations, weights, strict=True):
+        found.setdefault(frozenset(item.cause for item in causes), weight.of(causes))
+    return tuple(item for causes in found.values() for item in causes)
 
 
 def remaining_of(held_out: Mapping[str, HeldOut], location: str | None) -> dict[str, Remaining]:

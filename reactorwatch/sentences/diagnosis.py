@@ -13,7 +13,16 @@ from reactorwatch.terminal import printable_lines
 
 if TYPE_CHECKING:
     from reactorwatch.diagnosis.difference import Difference
-    from reactorwatch.diagnosis.result import AdjustedParameter, Cause, Curves, Diagnosis, Estimate, HeldOut, Law
+    from reactorwatch.diagnosis.result import (
+        AdjustedParameter,
+        Cause,
+        Curves,
+        Diagnosis,
+        Estimate,
+        HeldOut,
+        Law,
+        Nuisance,
+    )
 
 INDENT = 14
 
@@ -31,6 +40,8 @@ def describe_verdict(diagnosis: "Diagnosis", *, are_listed: bool = False) -> str
             f"The simulation is right within what was stated of its parameters: {' and '.join(off)} "
             f"{'is' if len(off) == 1 else 'are'} a little off, and the rest of the record is noise."
         )
+    if diagnosis.verdict == "nominal" and diagnosis.nuisance:
+        return f"The simulation is right but for small corrections: {describe_nuisance(diagnosis)}."
     if diagnosis.verdict == "nominal":
         return "The simulation is right: the rest of the record is noise."
     matters = describe_significance(diagnosis)
@@ -45,11 +56,38 @@ def describe_verdict(diagnosis: "Diagnosis", *, are_listed: bool = False) -> str
         return f"The simulation is wrong, and the record cannot tell why: {' or '.join(names)}. {matters}"
     if diagnosis.verdict == "named":
         causes = [f"{cause.label}, {describe_timing(cause, diagnosis.curves)}" for cause in diagnosis.causes]
-        return f"The simulation is wrong: {'; and '.join(causes)}. {matters}"
+        mostly = ", mostly by" if diagnosis.grade == "mostly" else ":"
+        share = f" This removes {_percent(diagnosis.causes[0].share)} of the error." if mostly != ":" else ""
+        return f"The simulation is wrong{mostly} {'; and '.join(causes)}.{share} {matters}"
     text = f"The simulation is wrong, and no known cause explains it; it acts {describe_location(diagnosis)}."
+    if diagnosis.grade == "nearest":
+        nearest = diagnosis.nearest[0]
+        text += f" Nearest is {nearest.label}, which removes {_percent(nearest.share)} of the error."
     if diagnosis.law is not None:
         text += f" A law explains it: {diagnosis.law.formula}, {diagnosis.law.term}."
     return f"{text} {matters}"
+
+
+def describe_nuisance(diagnosis: "Diagnosis") -> str:
+    """What differs a little beside the causes, in words."""
+    return ", ".join(_describe_correction(item) for item in diagnosis.nuisance)
+
+
+def _describe_correction(item: "Nuisance") -> str:
+    """One small correction: times in seconds, shares in per cent."""
+    signal, _, kind = item.name.rpartition(".")
+    value = item.value
+    if kind in ("delay", "lag") and value.unit == "min":
+        seconds = replace(value, value=60.0 * abs(value.value), sd=60.0 * value.sd, unit="s")
+        amount = format_interval(seconds)
+        return (
+            f"{signal} follows with {amount}"
+            if kind == "lag"
+            else (f"{signal} is {amount} {'late' if value.value > 0.0 else 'early'}")
+        )
+    if value.unit == "1":
+        value = replace(value, value=100.0 * value.value, sd=100.0 * value.sd, unit="%")
+    return f"{item.name} {format_interval(value)}"
 
 
 def describe_training(diagnosis: "Diagnosis") -> str:
@@ -252,6 +290,18 @@ def describe_difference(name: str, item: "Difference") -> str:
     return f"{text}; most {', '.join(places)}." if places else f"{text}; everywhere alike."
 
 
+def describe_odds(probability: float) -> str:
+    """A probability in per cent; no more than 99: what is not in the catalogue is not counted.
+
+    >>> describe_odds(0.9997)
+    'more than 99 % likely among the explanations'
+    >>> describe_odds(0.354)
+    '35 % likely among the explanations'
+    """
+    share = "more than 99 %" if probability > 0.99 else f"{100.0 * probability:.2g} %"
+    return f"{'less than 1 %' if probability < 0.01 else share} likely among the explanations"
+
+
 def _percent(share: float) -> str:
     return f"{100 * share:.0f} %" if share >= 0.01 else "less than 1 %"
 
@@ -278,6 +328,19 @@ def diagnosis_text(diagnosis: "Diagnosis", effects: Sequence[Effect]) -> str:
             _line("size", f"{describe_size(cause, effects)}  (95 %)"),
             _line("when", describe_timing(cause, diagnosis.curves)),
         ]
+    if diagnosis.causes and isfinite(diagnosis.causes[0].share) and not ambiguous:
+        first = diagnosis.causes[0]
+        lines.append(
+            _line("share", f"removes {_percent(first.share)} of the squared error; {describe_odds(first.probability)}")
+        )
+    if diagnosis.nuisance and diagnosis.verdict != "nominal":
+        lines.append(_line("beside", f"{describe_nuisance(diagnosis)}  (95 %)"))
+    if diagnosis.verdict == "unknown":
+        lines += [
+            _line("nearest", f"{describe_explanation([item], effects)}; removes {_percent(item.share)} of the error")
+            for item in diagnosis.nearest
+            if item.share >= 0.01
+        ]
     if len(diagnosis.locations) > 1:
         places = [f"{describe_place(item.location)} ({item.delta_bic:.1f})" for item in diagnosis.locations]
         lines.append(_line("where", f"{', '.join(places)}: worse in BIC"))
@@ -292,7 +355,7 @@ def diagnosis_text(diagnosis: "Diagnosis", effects: Sequence[Effect]) -> str:
         lines.append(_line("held out", describe_holdout(name, item, improved=diagnosis.is_extended)))
     if not ambiguous:
         lines += _alternatives(diagnosis, effects) + _experiment(diagnosis)
-    if diagnosis.causes and not diagnosis.alternatives:
+    if diagnosis.causes and not diagnosis.alternatives and diagnosis.grade != "mostly":
         lines.append(_line("or", "nothing else in the catalogue comes near"))
     lines += [_line("note", remark) for remark in diagnosis.remarks]
     return printable_lines(lines)

@@ -27,7 +27,7 @@ def graded(item: Explanation, explained: Explained, tolerances: Array) -> Graded
     """
     lead = 2.0 * (item.log_evidence - explained.none.log_evidence)
     left, effect = (float(np.max(each / tolerances)) for each in (item.left, item.effect_size))
-    return Graded(lead, item.share, left, effect, item.fitted.hypothesis.kind == CONSTANT)
+    return Graded(lead, item.share, left, effect, CONSTANT if item.effect is None else item.fitted.hypothesis.kind)
 
 
 def causes_of(item: Explanation, explained: Explained) -> list[Cause]:

@@ -4,9 +4,21 @@ from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
-from reactorwatch.diagnosis.diagnose import SURE, _alternatives, _decide_verdict, _drop_hidden
+from reactorwatch.diagnosis.decide import (
+    SMALL_LEFT,
+    SURE,
+    Found,
+    Graded,
+    PlaceFound,
+    Verdict,
+    decide,
+    decide_without_nuisance,
+    grade_of,
+)
+from reactorwatch.diagnosis.diagnose import _alternatives, _drop_hidden, _found
 from reactorwatch.diagnosis.result import AMBIGUOUS, LISTED, NAMED, NOMINAL, UNKNOWN
 from reactorwatch.diagnosis.search.search import FittedHypothesis, SearchResult
 
@@ -53,14 +65,14 @@ def test_the_verdict_follows_from_the_causes_near_the_best(
     hypotheses: list[tuple[tuple[str, ...], float]], verdict: str
 ) -> None:
     found = result(*hypotheses)
-    assert _decide_verdict(found, found.best) == verdict
+    assert decide_without_nuisance(_found(found, found.best, np.zeros(1)), None) == verdict
 
 
 @pytest.mark.parametrize("nearest", [0.01, 100.0])
 def test_the_nominal_hypothesis_wins_whatever_is_near(nearest: float) -> None:
-    found = result(((LEAK,), nearest), nominal=0.0)
-    assert _decide_verdict(found, found.best) == NOMINAL
-    assert _alternatives(found, found.best) == []
+    found = result(((LEAK,), nearest), nominal=0.0)  # of which the search takes the nominal one
+    assert decide_without_nuisance(_found(found, found.nominal, np.zeros(1)), None) == NOMINAL
+    assert _alternatives(found, found.nominal) == []
 
 
 def test_the_alternatives_are_the_best_of_every_other_set_of_causes_within_the_limit() -> None:
@@ -88,3 +100,70 @@ def test_hypotheses_of_sources_are_left_out_if_a_named_one_is_near(named: float,
 def test_without_a_named_hypothesis_the_sources_stay() -> None:
     found = result(((SOURCE,), 0.0))
     assert _drop_hidden(found, found.hypotheses[0].hypothesis.filter.effects) is found
+
+
+WHITE_RESIDUAL, COLOURED, MUCH = 0.3, 9.0, 40.0  # minus the decimal logarithms of p-values
+
+
+@pytest.mark.parametrize(
+    ("found", "place", "verdict"),
+    [
+        (Found(50.0, False, False, 1, WHITE_RESIDUAL), PlaceFound(False, -100.0, True), NAMED),
+        (Found(50.0, False, False, 1, WHITE_RESIDUAL), PlaceFound(True, 100.0, True), UNKNOWN),
+        (Found(50.0, False, False, 2, WHITE_RESIDUAL), PlaceFound(False, 0.0, True), AMBIGUOUS),
+        (Found(50.0, False, False, 1, COLOURED), PlaceFound(False, -100.0, True), NAMED),
+        (Found(50.0, False, False, 1, COLOURED), PlaceFound(False, -100.0, False), UNKNOWN),
+        (Found(50.0, False, False, 1, MUCH), PlaceFound(False, -100.0, True), UNKNOWN),
+        (Found(50.0, False, False, 2, 15.0), PlaceFound(False, -100.0, True), UNKNOWN),
+        (Found(0.0, False, False, 0, MUCH), PlaceFound(False, -100.0, False), UNKNOWN),
+        (Found(0.0, False, False, 0, WHITE_RESIDUAL), PlaceFound(True, 100.0, True), NOMINAL),
+    ],
+)
+def test_an_unknown_is_said_where_a_place_or_the_residual_calls_for_it(
+    found: Found, place: PlaceFound, verdict: str
+) -> None:
+    assert decide_without_nuisance(found, place) == verdict
+
+
+NONE = Graded(0.0, 0.0, 4.0, 0.0, "constant")
+WITHIN = NONE._replace(left=0.9)
+CAUSE = Graded(500.0, 0.99, 0.1, 3.0, "step")
+
+
+@pytest.mark.parametrize(
+    ("none", "graded", "said"),
+    [
+        (NONE, [CAUSE], Verdict(NAMED, "explained", with_nuisance=True)),
+        (NONE, [CAUSE._replace(share=0.7, left=2.0)], Verdict(NAMED, "mostly", with_nuisance=True)),
+        (NONE, [CAUSE._replace(share=0.7, left=0.9)], Verdict(NAMED, "explained", with_nuisance=True)),
+        (NONE, [CAUSE, CAUSE._replace(lead=491.0)], Verdict(AMBIGUOUS, "explained", with_nuisance=True)),
+        (NONE, [CAUSE, CAUSE._replace(lead=489.0)], Verdict(NAMED, "explained", with_nuisance=True)),
+        (NONE, [CAUSE._replace(share=0.4, left=3.0)], Verdict(UNKNOWN, "nearest")),
+        (NONE, [CAUSE._replace(share=0.05, left=3.9)], Verdict(UNKNOWN, "unknown")),
+        (NONE, [CAUSE._replace(lead=9.9)], Verdict(NOMINAL, "right", with_nuisance=True)),
+        (WITHIN, [CAUSE], Verdict(NAMED, "explained", with_nuisance=True)),
+        (WITHIN, [CAUSE._replace(effect=0.4)], Verdict(NOMINAL, "right", with_nuisance=True)),
+        (WITHIN, [CAUSE._replace(share=0.7)], Verdict(NOMINAL, "right", with_nuisance=True)),
+        (WITHIN, [CAUSE._replace(profile="constant")], Verdict(NOMINAL, "right", with_nuisance=True)),
+    ],
+)
+def test_the_grade_follows_from_what_the_best_cause_removes_and_leaves(
+    none: Graded, graded: list[Graded], said: Verdict
+) -> None:
+    assert decide(UNKNOWN, 0.0, 4.0, none, graded) == said
+
+
+def test_a_law_stays_unless_a_cause_explains_the_record_or_nuisance_alone_leaves_next_to_nothing() -> None:
+    constant = [CAUSE._replace(profile="constant")]
+    curve, part = CAUSE._replace(profile="free"), CAUSE._replace(share=0.9)
+    assert decide(UNKNOWN, 0.0, 4.0, WITHIN, [curve], is_law=True) == Verdict(UNKNOWN, "nearest")
+    assert decide(UNKNOWN, 0.0, 4.0, WITHIN, [part], is_law=True) == Verdict(UNKNOWN, "nearest")
+    assert decide(UNKNOWN, 0.0, 4.0, WITHIN, [CAUSE], is_law=True).verdict == NAMED
+    assert decide(UNKNOWN, 0.0, 4.0, WITHIN, constant, is_law=True) == Verdict(UNKNOWN, "nearest")
+    nothing = WITHIN._replace(left=0.9 * SMALL_LEFT)
+    assert decide(UNKNOWN, 0.0, 4.0, nothing, constant, is_law=True).verdict == NOMINAL
+
+
+@pytest.mark.parametrize("verdict", [NOMINAL, NAMED, AMBIGUOUS, UNKNOWN])
+def test_without_nuisance_the_verdict_of_the_search_stays(verdict: str) -> None:
+    assert decide(verdict, 0.97, 3.0, None, []) == Verdict(verdict, grade_of(verdict, 0.97, 3.0))

@@ -119,13 +119,14 @@ def test_people_read_sizes_onsets_rivals_experiment_gain_and_remarks() -> None:
 def test_the_object_has_the_keys_that_are_promised_and_nothing_else(case: str) -> None:
     stated = json.loads(msgspec.json.encode(CASES[case].to_dict()))
     assert list(stated) == [
-        "file", "zero", "samples", "runs", "span_min", "seconds", "verdict", "causes", "alternatives", "location",
-        "locations", "law", "significant", "practical", "gain", "adequacy", "experiment", "extended_model",
+        "file", "zero", "samples", "runs", "span_min", "seconds", "verdict", "grade", "causes", "alternatives",
+        "nearest", "onset", "nuisance", "remaining", "location", "locations", "law", "significant", "practical",
+        "gain", "adequacy", "experiment", "extended_model",
     ]  # fmt: skip
     for item in stated["gain"]["held_out"].values():
         assert list(item) == ["rmse_before", "rmse_after", "noise_sd", "unit"]
     for cause in [*stated["causes"], *(cause for item in stated["alternatives"] for cause in item["causes"])]:
-        assert list(cause) == ["cause", "profile", "label", "location", "parameters"]
+        assert list(cause) == ["cause", "profile", "label", "location", "parameters", "share", "probability"]
         assert next(iter(cause["parameters"])) == "size"
         assert all(list(item) == ["value", "sd", "unit"] for item in cause["parameters"].values())
 
