@@ -32,10 +32,14 @@ Job = tuple[str, int, int, bool]
 """Plant, seed, number, and whether the plant is sound."""
 
 
+def draw_record(job: Job) -> Drawn:
+    """Draw a record."""
+    return PLANTS[job[0]](*job[1:])
+
+
 def diagnose_record(job: Job) -> dict[str, Any]:
     """Draw a record, diagnose it by the command, and score what it prints."""
-    plant, *which = job
-    drawn = PLANTS[plant](*which)
+    drawn = draw_record(job)
     with tempfile.TemporaryDirectory() as folder:
         path, process = write_files(drawn, Path(folder))
         before = _children_s()
@@ -69,10 +73,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     numbers = [(i, False) for i in range(options.n)] + [(i, True) for i in range(options.sound)]
     jobs: list[Job] = [(options.plant, options.seed, *item) for item in numbers]
     if options.only:
-        jobs = [job for job in jobs if PLANTS[job[0]](*job[1:]).group == options.only]
+        jobs = [job for job in jobs if draw_record(job).group == options.only]
     if options.files:
-        for plant, *which in jobs:
-            write_files(PLANTS[plant](*which), options.files)
+        for job in jobs:
+            write_files(draw_record(job), options.files)
         return 0
     print(table(Pool(options.jobs, results=options.out).run("inexact", diagnose_record, jobs)))
     return 0

@@ -4,6 +4,7 @@ import csv
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -90,12 +91,7 @@ def integrate(
     edges = np.unique(breaks)
     x, pieces = np.asarray(start, dtype=np.float64), []
     for begin, end in pairwise(edges.tolist()):
-        middle = 0.5 * (begin + end)
-        done = solve_ivp(
-            lambda _, x, at=middle: rates(at, x), (begin, end), x, "DOP853", dense_output=True, rtol=1e-9, atol=1e-9
-        )
-        if not done.success:
-            raise ArithmeticError(f"integration from {begin:g} to {end:g}: {done.message}")
+        done = _solve(partial(rates, 0.5 * (begin + end)), begin, end, x)
         pieces.append(done.sol)
         x = done.y[:, -1]
 
@@ -104,6 +100,14 @@ def integrate(
         return np.stack([pieces[i](t) for i, t in zip(piece.tolist(), times.tolist(), strict=True)], axis=1)
 
     return states
+
+
+def _solve(rates: Callable[[Array], Array], begin: float, end: float, x: Array) -> Any:
+    """Integrate autonomous equations."""
+    done = solve_ivp(lambda _, x: rates(x), (begin, end), x, "DOP853", dense_output=True, rtol=1e-9, atol=1e-9)
+    if not done.success:
+        raise ArithmeticError(f"integration from {begin:g} to {end:g}: {done.message}")
+    return done
 
 
 def draw_moves(

@@ -76,7 +76,7 @@ def draw(seed: int, number: int, sound: bool) -> Drawn:
 
     breaks = [-SETTLING_S, *moves[0][0], *moves[1][0], onset_s, end_s + 10.0]
     states = integrate(rates, [23.0] * 4, breaks)
-    time_s = PERIOD_S * np.arange(ROWS)
+    time_s = PERIOD_S * np.arange(ROWS, dtype=np.float64)
     columns = {"Time (sec)": time_s}
     columns |= {f"Heater {i + 1} (%)": level_at(moves[i], time_s) for i in range(2)}
     for i in range(2):
