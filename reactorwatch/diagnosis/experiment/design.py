@@ -175,9 +175,12 @@ class _ExperimentSearch:
             alternative.name: dict(zip(self._model.output_names, run.measured.T, strict=True))
             for alternative, run in zip(self._alternatives.members, runs, strict=True)
         }
+        moves = tuple((round(float(time_min[row]), 6), float(levels[row])) for row in changes.tolist())
+        resting = zip(self._model.input_names, self._alternatives.rest.tolist(), strict=True)
+        by_input = {name: ((0.0, level),) for name, level in resting} | {item.name: moves}
         return Experiment(
             why=why,
-            input=tuple((round(float(time_min[row]), 6), float(levels[row])) for row in changes.tolist()),
+            input=moves if len(by_input) == 1 else by_input,
             separates=tuple(names),
             expected_delta_bic=hardest.expected_delta_bic,
             probability=hardest.probability,

@@ -161,6 +161,8 @@ def test_an_experiment_moves_the_input_that_separates_the_explanations(folder: P
     experiment = found.experiment
     assert experiment is not None
     assert experiment.signal == "P"
+    assert isinstance(experiment.input, dict)
+    assert [len(moves) > 1 for moves in (experiment.input["q"], experiment.input["P"])] == [False, True]
     assert {"P.gain", "P.offset"} <= set(experiment.separates)
     assert experiment.probability > 0.99
     model = find_process(folder / "plain.py").require_model()
