@@ -43,7 +43,7 @@ from reactorwatch.kalman.filter_states import (
     widen_model,
 )
 from reactorwatch.kalman.noise_estimation import NoiseFit
-from reactorwatch.process import effects_of
+from reactorwatch.process import DEFAULT_PROCESS, effects_of, own_effects
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.extended_model import parse_extended_model, stored_model
 from reactorwatch.process.generic import needs_moves
@@ -83,8 +83,7 @@ class DiagnosisJob(NamedTuple):
         signals: names of the signals in a row, the input first.
         equations: the model as JSON (`ExtendedModel.to_object`), times in minutes since 1970-01-01 UTC.
         process: name or file of the process, as the monitor was given it.
-        causes: names of effects of the process's own, which JSON cannot hold; None: it has those of the catalogue, or
-            generic ones.
+        causes: names of effects of the process's own, which JSON cannot hold; None: those of the model's name.
         effects: these effects; None: they are loaded from the process. They may be a user's code, and are not pickled.
     """
 
@@ -110,11 +109,11 @@ class DiagnosisJob(NamedTuple):
             InputError: the model, or the file of the process, cannot be read, or the file lacks a cause now.
         """
         model = parse_extended_model(self.equations).shift(-self.first_ns / MINUTE_NS).build()
-        if not self.causes:
-            return model if self.causes is None else replace(model, effects=())
+        if self.causes is None or self.causes == tuple(effect.name for effect in own_effects(model)):
+            return model
         if self.effects is not None:
             return replace(model, effects=self.effects)
-        found = {effect.name: effect for effect in find_process(self.process or "", on_bus=True).causes}
+        found = {effect.name: effect for effect in find_process(self.process or DEFAULT_PROCESS, on_bus=True).causes}
         if missing := [name for name in self.causes if name not in found]:
             raise InputError(
                 f"{self.process} must have the causes that it had when the monitor started, lacks {missing[0]}"
@@ -212,7 +211,7 @@ def read_equations(text: str, given: ProcessModel | None = None) -> ProcessModel
 
     Args:
         text: the JSON.
-        given: the model of the process as given, whose effects it has, too; None: it has those of its name.
+        given: the model of the process as given, whose own effects it has, too; None: it has those of its name.
 
     Raises:
         InputError: it is no model of this software.
@@ -221,7 +220,9 @@ def read_equations(text: str, given: ProcessModel | None = None) -> ProcessModel
         model = parse_extended_model(text).rebase(0).build()
     except InputError as error:
         raise InputError(f"the model of the baseline {error}") from error
-    return model if given is None or given.effects is None else replace(model, effects=given.effects)
+    if given is None or own_effects(model) == own_effects(given):
+        return model
+    return replace(model, effects=own_effects(given))
 
 
 def _json(extended: dict[str, Any]) -> str:

@@ -11,7 +11,6 @@ same there.
 
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from typing import cast
 
 import msgspec
 
@@ -35,7 +34,7 @@ from reactorwatch.contract.codec import check_signature
 from reactorwatch.contract.messages_pb2 import Baseline, BaselineCommand
 from reactorwatch.diagnosis.result import NOMINAL
 from reactorwatch.errors import InputError
-from reactorwatch.process.effect import Effect
+from reactorwatch.process import own_effects
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.stored_state import Memory, copy_of
 
@@ -335,9 +334,8 @@ class ModelUpdate:
         """The pending diagnosis; None: there is none."""
         if self.rows is None or self._model is None or self.changes:
             return None
-        effects = cast(tuple[Effect, ...] | None, self._model.effects)
-        causes = None if effects is None else tuple(effect.name for effect in effects)
-        text, config = equations_text(self._model), self._config
+        effects, config = own_effects(self._model), self._config
+        causes, text = tuple(effect.name for effect in effects), equations_text(self._model)
         return DiagnosisJob(self.rows, config.signals, text, config.process, causes, effects)
 
     @property

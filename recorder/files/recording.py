@@ -133,7 +133,7 @@ def _equations_metadata(process: Process) -> dict[str, str]:
     if model is None or model.breakpoints:  # times of deviations count from a zero that is not known here
         return {}
     extended = stored_model(model)
-    if process.effects != own_effects(extended.build()):
+    if process.effects != (own_effects(model) if extended.equations is None else ()):
         return {}
     given = {name: KnownParameter.of(item) for name, item in process.parameters.items()}
     return {

@@ -184,7 +184,7 @@ class Predictions:
 
         Args:
             levels: levels of the input that is moved, shape (rows,).
-            moved: its index; the others rest.
+            moved: index of the input that is moved.
         """
         time_min = self.members[0].start_min + self.period_min * np.arange(levels.size, dtype=np.float64)
         inputs = np.tile(self.rest, (levels.size, 1))
