@@ -19,7 +19,14 @@ from monitor_node.health import NODE, Failures
 from monitor_node.learn.arx import ArxReference
 from monitor_node.learn.baseline import TrainingResult, learn_baseline
 from monitor_node.learn.training import Training
-from monitor_node.learn.training_diagnosis import FAILED, DiagnosisJob, Finding, equations_text, read_equations
+from monitor_node.learn.training_diagnosis import (
+    FAILED,
+    DiagnosisJob,
+    Finding,
+    describe_still_inputs,
+    equations_text,
+    read_equations,
+)
 from monitor_node.learn.training_rows import TrainingRows
 from monitor_node.watch.evaluation import Evaluation, EvaluationMemory
 from monitor_node.watch.operation import Operation
@@ -27,6 +34,7 @@ from reactorwatch.contract.codec import check_signature
 from reactorwatch.contract.messages_pb2 import Baseline, BaselineCommand
 from reactorwatch.diagnosis.result import NOMINAL
 from reactorwatch.errors import InputError
+from reactorwatch.process import own_effects
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.stored_state import Memory, copy_of
 
@@ -76,7 +84,7 @@ class Baselines:
         self._config, self._model, self._operation = config, model, operation
         self._evaluation, self._models = evaluation, evaluation.models
         self._failures, self._diagnose = failures, diagnose
-        self.training, self.update = Training(config, model, self._models), ModelUpdate(config, changes)
+        self.training, self.update = Training(config, model, self._models), ModelUpdate(config, model, changes)
         self.kept: list[EvaluationMemory] = []
         self.modes = ModesMemory([float("nan")] * len(config.modes))
 
@@ -103,7 +111,7 @@ class Baselines:
     ) -> Baseline | None:
         """Judge by what was learned from now on; returns the change of the model by the diagnosis of the training."""
         self.start(trained, period_ns)
-        if self._config.diagnose_training and equations_text(self._model):
+        if self._config.diagnose_training and self._model is not None:
             self.update.rows = trained.rows
         if self._diagnose is not None and (job := self.diagnosis_job) is not None:
             self.on_finding(self._diagnose(job))
@@ -116,6 +124,8 @@ class Baselines:
         """Start to judge by what was learned."""
         self.modes.is_learned, self.modes.reference = True, trained.reference.kind
         self._evaluation.start(trained, period_ns, again=False)
+        if self._model is not None and trained.reference.follows_equations:
+            self._evaluation.notes += describe_still_inputs(self._model, trained.rows.arrays.inputs)
         self._operation.end_training()
 
     def _check_training(self, trained: TrainingResult, period_ns: float, units: Sequence[str]) -> None:
@@ -125,7 +135,7 @@ class Baselines:
     @property
     def diagnosis_job(self) -> DiagnosisJob | None:
         """The diagnosis of the training, while it is pending."""
-        return self.update.job(self._model)
+        return self.update.job
 
     def on_finding(self, finding: Finding) -> None:
         """Process the result of a diagnosis; a change holds from the next row on."""
@@ -185,7 +195,7 @@ class Baselines:
     def equations_of(self, memory: EvaluationMemory) -> ProcessModel | None:
         """Process model of a baseline; None: there is none. The newest change may be of another mode."""
         change = memory.change
-        return self._model if change is None or not change.model else read_equations(change.model)
+        return self._model if change is None or not change.model else read_equations(change.model, self._model)
 
     def schedule(self, command: BaselineCommand) -> Baseline:
         """Schedule a command for the next row; returns the change.
@@ -312,18 +322,21 @@ class ModelUpdate:
         baseline: the change in force; None: the plant is judged by the model as given.
     """
 
-    def __init__(self, config: MonitorConfig, changes: deque[Baseline]) -> None:
-        self._config = config
+    def __init__(self, config: MonitorConfig, model: ProcessModel | None, changes: deque[Baseline]) -> None:
+        self._config, self._model = config, model
         self._last_ns: int | None = None
         self.changes = changes
         self.rows: TrainingRows | None = None
         self.baseline: Baseline | None = None
 
-    def job(self, model: ProcessModel | None) -> DiagnosisJob | None:
+    @property
+    def job(self) -> DiagnosisJob | None:
         """The pending diagnosis; None: there is none."""
-        if self.rows is None or self.changes:
+        if self.rows is None or self._model is None or self.changes:
             return None
-        return DiagnosisJob(self.rows, self._config.signals, equations_text(model))
+        effects, config = own_effects(self._model), self._config
+        causes, text = tuple(effect.name for effect in effects), equations_text(self._model)
+        return DiagnosisJob(self.rows, config.signals, text, config.process, causes, effects)
 
     @property
     def is_pending(self) -> bool:
@@ -380,7 +393,9 @@ class ModelUpdate:
         """
         assert self.rows is not None
         rows, self.rows = self.rows, None
-        trained = learn_baseline(self._config, read_equations(change.model), models.copy(), rows, last_chance=True)
+        trained = learn_baseline(
+            self._config, read_equations(change.model, self._model), models.copy(), rows, last_chance=True
+        )
         if trained.refused or not trained.reference.follows_equations:
             return None
         self.baseline = change
