@@ -35,7 +35,7 @@ STEP_OFF, WANDER, WANDER_UNSEEN, WANDER_ROWS = 0.02, 0.03, 0.015, 20.0
 
 PCGYM = user_cache_path("reactorwatch") / "pcgym"
 PACKAGES = ("casadi", "cloudpickle", "diffrax", "do-mpc", "gymnasium", "jax[cpu]", "matplotlib", "tqdm")
-"""What pcgym imports; it asks for torch, onnx and ruff as well, which the four tanks do not use."""
+"""Packages that pcgym imports; it asks for torch, onnx and ruff as well, which the four tanks do not use."""
 
 Stretch = tuple[Mapping[str, float], Array]
 """Constants of the plant, and its inputs by row."""
