@@ -13,10 +13,12 @@ that is colder takes heat that does not grow with the temperature, and `T1.gain`
 import re
 from itertools import combinations
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from scipy.integrate import solve_ivp
 
-from benchmarks.inexact.records import Array, Cause, Drawn, draw_moves, integrate, level_at
+from benchmarks.inexact.records import Array, Cause, Drawn, draw_moves, level_at
 
 KINDS = ("skew", "moves", "lag", "constants", "capacity", "quantised")
 PAIRS = tuple(combinations(KINDS, 2))
@@ -50,12 +52,12 @@ def draw(seed: int, number: int, sound: bool) -> Drawn:
     """Draw a record."""
     rng = np.random.default_rng([seed, int(sound), number])
     kinds, end_s = kinds_of(seed, number), PERIOD_S * ROWS
-    inexact: dict[str, float] = {}
+    off_by: dict[str, float] = {}
 
     def off(kind: str, name: str, nominal: float = 1.0) -> float:
         if kind in kinds:
-            inexact[name] = float(rng.choice((-0.05, 0.05)))
-        return nominal * (1.0 + inexact.get(name, 0.0))
+            off_by[name] = float(rng.choice((-0.05, 0.05)))
+        return nominal * (1.0 + off_by.get(name, 0.0))
 
     plant = np.array([off("constants", "U", 10.0), 23.0, off("constants", "alpha1", 0.01)])
     plant = np.append(plant, off("constants", "alpha2", 0.0075))
@@ -66,30 +68,28 @@ def draw(seed: int, number: int, sound: bool) -> Drawn:
     cause, faulty, bias = (None, plant, np.zeros(2)) if sound else _draw_cause(rng, seed, number, plant, onset_s)
     lags = rng.uniform(5.0, 20.0, 2) if "lag" in kinds else np.zeros(2)
     skews = rng.uniform(0.5, 5.0, 2) if "skew" in kinds else np.zeros(2)
-    inexact |= {f"T{i + 1}.lag_s": float(lags[i]) for i in range(2) if lags[i]}
-    inexact |= {f"T{i + 1}.skew_s": float(skews[i]) for i in range(2) if skews[i]}
+    off_by |= {f"T{i + 1}.lag_s": float(lags[i]) for i in range(2) if lags[i]}
+    off_by |= {f"T{i + 1}.skew_s": float(skews[i]) for i in range(2) if skews[i]}
 
     def rates(time_s: float, x: Array) -> Array:
         powers = np.array([level_at(item, time_s) for item in moves])
         heat = _heat(faulty if time_s >= onset_s else plant, x[:2], powers)
         return np.concatenate([heat / heat_capacity, (x[:2] - x[2:]) / np.where(lags > 0.0, lags, 1.0)])
 
-    breaks = [-SETTLING_S, *moves[0][0], *moves[1][0], onset_s, end_s + 10.0]
-    states = integrate(rates, [23.0] * 4, breaks)
+    settings: Any = {"dense_output": True, "rtol": 1e-9, "atol": 1e-9, "max_step": 20.0}
+    solution: Any = solve_ivp(rates, (-SETTLING_S, end_s + 10.0), [23.0] * 4, "DOP853", **settings).sol
     time_s = PERIOD_S * np.arange(ROWS, dtype=np.float64)
     columns = {"Time (sec)": time_s}
     columns |= {f"Heater {i + 1} (%)": level_at(moves[i], time_s) for i in range(2)}
     for i in range(2):
         read_s = time_s + skews[i]
-        value = states(read_s)[2 + i if lags[i] else i] + bias[i] * (read_s >= onset_s)
+        value = solution(read_s)[2 + i if lags[i] else i] + bias[i] * (read_s >= onset_s)
         value += NOISE_K * rng.standard_normal(ROWS)
         step = 0.25 if "quantised" in kinds else 0.001  # of a logger that writes millidegrees
         columns[f"Temperature {i + 1} (degC)"] = np.round(value / step) * step
     group = kinds[0] if len(kinds) == 1 else "pairs"
-    return Drawn(
-        "two-heaters", group, seed, number, process_file(), columns, cause, PERIOD_S / 60.0,
-        {"kinds": list(kinds), **inexact},
-    )  # fmt: skip
+    inexact = {"kinds": kinds, **off_by}
+    return Drawn("two_heaters", group, seed, number, process_file(), columns, PERIOD_S / 60.0, cause, inexact)
 
 
 def _heat(plant: Array, T: Array, powers: Array) -> Array:
