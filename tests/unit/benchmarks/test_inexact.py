@@ -48,7 +48,9 @@ def test_a_process_file_has_the_equations_of_the_simulator_of_others(name: str) 
         if not foreign.PCGYM.exists():
             pytest.skip("pcgym is not installed (python -m benchmarks.inexact.foreign)")
     else:
-        pytest.importorskip({"tclab_simulator": "tclab", "van_de_vusse": "do_mpc"}[name], reason="group peers")
+        pytest.importorskip(
+            {"tclab_simulator": "tclab", "van_de_vusse": "do_mpc"}[name], reason="needs the group peers"
+        )
     plant, rows = foreign.PLANTS[name], foreign.SETTLING_ROWS + 60
     levels = np.array(list(plant["inputs"].values()))
     inputs = np.where(np.arange(rows)[:, None] < foreign.SETTLING_ROWS + 10, levels @ [0.7, 0.3], levels @ [0.4, 0.6])
