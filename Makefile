@@ -1,6 +1,6 @@
 # make demo and make test set everything up by themselves; make setup does only that.
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test slow lint bench faults study kills cuts fuzz soak promise outside reproduce pictures docs examples protobuf lock dist clean
+.PHONY: help setup demo test slow lint bench faults study inexact kills cuts fuzz soak promise outside reproduce pictures docs examples protobuf lock dist clean
 
 PYTHON ?= python3
 BIN := .venv/bin
@@ -54,6 +54,9 @@ faults: $(READY) ## detection delays on a bank of faults, beside an oracle and t
 
 study: $(READY) ## the diagnosis of hidden causes; writes its tables into docs/diagnosis_study.md: hours
 	@$(BIN)/python benchmarks/diagnosis_study.py --write $(if $(RESULTS),--results $(RESULTS))
+
+inexact: $(READY) ## diagnoses of records that are not quite their model (PLANT=two-heaters|foreign|reactor N=40 SEED=1 OUT=file.jsonl, which continues)
+	@$(BIN)/python -m benchmarks.inexact $(or $(PLANT),two-heaters) --n $(or $(N),40) --seed $(or $(SEED),1) $(if $(OUT),--out $(OUT))
 
 kills: $(READY) ## kill a recorder fifty times under load, and count what is missing: three minutes
 	@$(BIN)/python benchmarks/losses.py kills

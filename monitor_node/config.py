@@ -135,7 +135,7 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
         false_alarms_per_30_days: number of false alarms in 30 days of the plant, over all alarms; None: 1, or the
             nearest number that the charts can keep for the number of alarms and the sampling period.
         smallest_sd: least standard deviation of the residual by output, in its unit; smaller deviations do not matter.
-        isolation: true to search the cause of an alarm, if the equations of a catalogued process judge.
+        isolation: true to search the cause of an alarm, if equations judge.
         isolation_rows: number of newest rows in that search.
         raise_count: number of violating points among the last `window` that raises the Shewhart chart's alarm.
         window: number of points in which `raise_count` is counted.

@@ -205,7 +205,9 @@ class MonitorNode(FleetMonitor):
                 log.info("training diagnosed", plant=plant, verdict=finding.verdict)
                 self.on_finding(plant, finding)
                 if finding.equations and self.is_single:
-                    extended = stage.preparation(self._monitors[plant].config, read_equations(finding.equations))
+                    monitor = self._monitors[plant]
+                    changed = read_equations(finding.equations, monitor.pipeline.model)
+                    extended = stage.preparation(monitor.config, changed)
                     self.preparation = chain(self.preparation or (), extended)
         publications = self._keep(super().on_tick(now_ns), now_ns)
         if self.is_single or now_ns >= self._report_ns:

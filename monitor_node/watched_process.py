@@ -6,6 +6,7 @@ little beyond it, so the model's bounds are widened.
 """
 
 from collections.abc import Mapping
+from dataclasses import replace
 from math import inf, isfinite
 from typing import Any, NamedTuple
 
@@ -84,7 +85,7 @@ def watch_process(config: MonitorConfig, process: Process, rows: int | None = No
         changed[key] = {name: value for name, value in values.items() if name in watched}
     if process.model is None:
         changed["process"] = WITHOUT_EQUATIONS
-    if process.name != DEFAULT.name:
+    if process.watch != DEFAULT.watch:
         if config.smallest_sd == DEFAULT.watch.smallest_sd:
             changed["smallest_sd"] = dict(process.watch.smallest_sd)
         if config.priorities == DEFAULT_PRIORITIES:
@@ -96,7 +97,10 @@ def watch_process(config: MonitorConfig, process: Process, rows: int | None = No
         changed_config = msgspec.structs.replace(config, **changed)
     except ValueError as error:  # what could not be checked without the signals
         raise InputError(f"settings [monitor]: {error}") from error
-    return WatchedProcess(limit_training(changed_config, rows, is_stated=_states_training(config)), process.model)
+    model = process.model
+    if model is not None and process.generic:  # its alarms are traced to all causes with which it is diagnosed
+        model = replace(model, effects=process.causes)
+    return WatchedProcess(limit_training(changed_config, rows, is_stated=_states_training(config)), model)
 
 
 def signal_settings(process: Process) -> dict[str, Any]:

@@ -1,10 +1,11 @@
 """Studies: jobs in processes with a file of their results, tables as text, exact intervals, and pages between marks."""
 
 import argparse
+import json
 import pickle
 import subprocess
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing
+from contextlib import closing, suppress
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
@@ -19,6 +20,9 @@ from reactorwatch.runtime.jobs import Failed, choose_executor
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
+
+JSON_LINES = ".jsonl"
+"""Ending of a file of results as text, for results that are JSON; all others are pickled."""
 
 
 class Pool:
@@ -62,16 +66,26 @@ class Pool:
         return [found[key] for key in keys]
 
     def _keep(self, key: str, result: object) -> None:
-        if self._file is not None:
-            with self._file.open("ab") as file:
+        if self._file is None:
+            return
+        with self._file.open("ab") as file:
+            if self._file.suffix == JSON_LINES:
+                file.write(json.dumps({"key": key, "result": result}).encode() + b"\n")
+            else:
                 pickle.dump((key, result), file)
 
 
 def _read(file: Path) -> Iterator[tuple[str, Any]]:
-    """Results of a file up to its end, or up to one that was only half written."""
+    """Results of a file, without one that was only half written."""
     if not file.exists():
         return
     with file.open("rb") as stream:
+        if file.suffix == JSON_LINES:
+            for text in stream:
+                with suppress(json.JSONDecodeError):
+                    item = json.loads(text)
+                    yield item["key"], item["result"]
+            return
         while True:
             try:
                 yield pickle.load(stream)

@@ -21,7 +21,7 @@ these together are one suspect, `UNKNOWN`.
 Causes that imitate each other share the probability, as they should: these rows do not distinguish them.
 
 A cause that adds a state, or is discontinuous, has no infinitesimal deviation, and is left to a diagnosis of the
-record.
+record. A stuck sensor has a check of its own.
 
 The linearised scan is accurate for a small fault: its best hypotheses are fitted to all rows. A large fault is followed
 from where it is still small. The fit starts from the scan of the first rows, and the number of rows is multiplied from
@@ -65,7 +65,7 @@ from reactorwatch.diagnosis.run import Run
 from reactorwatch.kalman.batch import BudgetExceededError, FilterResult, StepBudget
 from reactorwatch.kalman.ekf import Filter
 from reactorwatch.kalman.ekf_step import NoiseLevels
-from reactorwatch.process import own_effects
+from reactorwatch.process import effects_of
 from reactorwatch.process.effect import Effect, SensorEffect
 from reactorwatch.process.model import MODEL_CACHE_SIZE, ProcessModel
 from reactorwatch.records.record import MINUTE_NS
@@ -79,8 +79,11 @@ SENSOR, PROCESS = "sensor", "process"
 
 @lru_cache(maxsize=MODEL_CACHE_SIZE)
 def causes_of(model: ProcessModel) -> tuple[Effect, ...]:
-    """Causes to which alarms of a plant with these equations are traced; empty if it has no effects of its own."""
-    traced = (effect for effect in own_effects(model) if effect.is_traced and not effect.is_discontinuous)
+    """Causes to which alarms of a plant with these equations are traced, of its own or generic effects.
+
+    A source has no physical meaning, and noise no mean.
+    """
+    traced = (item for item in effects_of(model) if item.is_traced and item.has_derivative and not item.is_source)
     return tuple(effect for effect in traced if effect.extend(model).state_names == model.state_names)
 
 

@@ -67,7 +67,7 @@ def preparation(config: MonitorConfig, model: ProcessModel | None) -> Iterator[N
 
 
 def has_causes(config: MonitorConfig, model: ProcessModel) -> bool:
-    """Return true if causes are searched with this model: the catalogue has some, and the plant is driven."""
+    """Return true if causes are searched with this model: it has some, and the plant is driven."""
     return config.isolation and bool(model.inputs and causes_of(model))
 
 

@@ -27,6 +27,7 @@ from monitor_node.learn.process_reference import fit_training_noise, model_outpu
 from monitor_node.learn.training_rows import RowArrays, TrainingRows, screen_baseline
 from reactorwatch.arrays import Array
 from reactorwatch.contract.messages_pb2 import Baseline
+from reactorwatch.description.read import find_process
 from reactorwatch.diagnosis.estimates import extended_model
 from reactorwatch.diagnosis.whiteness import minus_log10_p
 from reactorwatch.errors import InputError
@@ -42,8 +43,10 @@ from reactorwatch.kalman.filter_states import (
     widen_model,
 )
 from reactorwatch.kalman.noise_estimation import NoiseFit
-from reactorwatch.process import EFFECTS_OF, effects_of
-from reactorwatch.process.extended_model import ExtendedModel, extended_model_of, is_complete, parse_extended_model
+from reactorwatch.process import DEFAULT_PROCESS, effects_of, own_effects
+from reactorwatch.process.effect import Effect
+from reactorwatch.process.extended_model import parse_extended_model, stored_model
+from reactorwatch.process.generic import needs_moves
 from reactorwatch.process.model import MODEL_CACHE_SIZE, ProcessModel
 from reactorwatch.process.profiles import FREE_NAME
 from reactorwatch.records.record import GAP_ROWS, MINUTE_NS, Record
@@ -79,16 +82,43 @@ class DiagnosisJob(NamedTuple):
         rows: the rows of the training.
         signals: names of the signals in a row, the input first.
         equations: the model as JSON (`ExtendedModel.to_object`), times in minutes since 1970-01-01 UTC.
+        process: name or file of the process, as the monitor was given it.
+        causes: names of effects of the process's own, which JSON cannot hold; None: those of the model's name.
+        effects: these effects; None: they are loaded from the process. They may be a user's code, and are not pickled.
     """
 
     rows: TrainingRows
     signals: tuple[str, ...]
     equations: str
+    process: str | None = None
+    causes: tuple[str, ...] | None = None
+    effects: tuple[Effect, ...] | None = None
+
+    def __reduce__(self) -> tuple[type["DiagnosisJob"], tuple[Any, ...]]:
+        return DiagnosisJob, self[:-1]
 
     @property
     def first_ns(self) -> int:
         """Time of the first row, which identifies the training."""
         return self.rows.times_ns[0]
+
+    def build_model(self) -> ProcessModel:
+        """The model with its effects, times in minutes since the first row.
+
+        Raises:
+            InputError: the model, or the file of the process, cannot be read, or the file lacks a cause now.
+        """
+        model = parse_extended_model(self.equations).shift(-self.first_ns / MINUTE_NS).build()
+        if self.causes is None or self.causes == tuple(effect.name for effect in own_effects(model)):
+            return model
+        if self.effects is not None:
+            return replace(model, effects=self.effects)
+        found = {effect.name: effect for effect in find_process(self.process or DEFAULT_PROCESS, on_bus=True).causes}
+        if missing := [name for name in self.causes if name not in found]:
+            raise InputError(
+                f"{self.process} must have the causes that it had when the monitor started, lacks {missing[0]}"
+            )
+        return replace(model, effects=tuple(found[name] for name in self.causes))
 
 
 class Finding(NamedTuple):
@@ -124,19 +154,21 @@ def diagnose_training(job: DiagnosisJob) -> Finding:
     times_ns, columns = np.array(job.rows.times_ns), np.column_stack(job.rows.arrays[1:]).T
     time_min = _shorten_gaps((times_ns - job.first_ns) / MINUTE_NS)
     record = Record(time_min, dict(zip(job.signals, columns, strict=True)), "training", zero_ns=job.first_ns)
-    given = parse_extended_model(job.equations)
-    effects = tuple(item.shift(-job.first_ns / MINUTE_NS) for item in given.effects)
-    model = replace(given, effects=effects).build()
+    model = job.build_model()
     outputs = job.signals[len(model.inputs) :]
     rows = RowArrays(time_min, columns[: len(model.inputs)].T, columns[len(model.inputs) :].T)
     uncertain = find_uncertain(model, outputs, rows)
     verdict, why, extended = _diagnose(record, model, uncertain)
     if extended is not None:
-        uncertain = find_uncertain(extended.build(), outputs, rows)
+        uncertain = find_uncertain(parse_extended_model(_json(extended)).build(), outputs, rows)
     if uncertain.names:
         why = f"{why}; {describe_uncertain(uncertain.names)}"
-    result = replace(extended or given, uncertain=uncertain.names)
-    return Finding(job.first_ns, verdict, why, _json(result.to_object()) if extended or uncertain.names else "")
+    if extended is None and not uncertain.names:
+        return Finding(job.first_ns, verdict, why)
+    found = parse_extended_model(job.equations).to_object() if extended is None else extended
+    return Finding(
+        job.first_ns, verdict, why, _json({**found, **({"uncertain": uncertain.names} if uncertain.names else {})})
+    )
 
 
 def _shorten_gaps(time_min: Array) -> Array:
@@ -149,8 +181,8 @@ def _shorten_gaps(time_min: Array) -> Array:
     return np.asarray(time_min + np.append(np.cumsum(excess[::-1])[::-1], 0.0))
 
 
-def _diagnose(record: Record, model: ProcessModel, uncertain: Uncertain) -> tuple[str, str, ExtendedModel | None]:
-    """Verdict of the diagnosis, the reason, and the model with the causes that last; None: there are none."""
+def _diagnose(record: Record, model: ProcessModel, uncertain: Uncertain) -> tuple[str, str, dict[str, Any] | None]:
+    """Verdict of the diagnosis, the reason, and the model with the causes that last as JSON; None: there are none."""
     from reactorwatch.diagnosis.diagnose import diagnose  # a quarter of a second, which no other row needs
 
     try:
@@ -162,33 +194,35 @@ def _diagnose(record: Record, model: ProcessModel, uncertain: Uncertain) -> tupl
     lasting = [cause for cause in found.causes if cause.profile != FREE_NAME]
     if not lasting:
         return found.verdict, describe_training(found), None
-    extended = extended_model(model, effects_of(model), lasting, record.zero_ns)
-    return found.verdict, describe_training(found), parse_extended_model(_json(extended))
-
-
-def equations_text(model: ProcessModel | None) -> str:
-    """JSON of a model as `diagnose` writes it; empty if the catalogue does not have the model, or no causes for it."""
-    if model is None or model.name not in EFFECTS_OF:
-        return ""
-    extended = extended_model_of(model)
-    if not is_complete(extended, model):
-        return ""
-    return msgspec.json.encode(extended.to_object()).decode()
+    return found.verdict, describe_training(found), extended_model(model, effects_of(model), lasting, record.zero_ns)
 
 
 @lru_cache(maxsize=MODEL_CACHE_SIZE)
-def read_equations(text: str) -> ProcessModel:
+def equations_text(model: ProcessModel) -> str:
+    """JSON of a model as `diagnose` writes it."""
+    return _json(stored_model(model).to_object())
+
+
+@lru_cache(maxsize=MODEL_CACHE_SIZE)
+def read_equations(text: str, given: ProcessModel | None = None) -> ProcessModel:
     """The model in `Baseline.model`, its clock that of samples on the bus: minutes since 1970-01-01 UTC.
 
     It is the same object for the same text: what is prepared for one is prepared for all.
+
+    Args:
+        text: the JSON.
+        given: the model of the process as given, whose own effects it has, too; None: it has those of its name.
 
     Raises:
         InputError: it is no model of this software.
     """
     try:
-        return parse_extended_model(text).rebase(0).build()
+        model = parse_extended_model(text).rebase(0).build()
     except InputError as error:
         raise InputError(f"the model of the baseline {error}") from error
+    if given is None or own_effects(model) == own_effects(given):
+        return model
+    return replace(model, effects=own_effects(given))
 
 
 def _json(extended: dict[str, Any]) -> str:
@@ -230,6 +264,22 @@ def find_uncertain(model: ProcessModel, outputs: tuple[str, ...], rows: RowArray
     certain, uncertain = fitter.sds_after_moves(plain), fitter.sds_after_moves(best)
     # the training leaves open how the plant follows
     return Uncertain(constants) if np.any(uncertain > 1.25 * certain) else Uncertain()
+
+
+def describe_still_inputs(model: ProcessModel, inputs: Array) -> list[str]:
+    """Describe which causes cannot be seen, as inputs never moved in the training; empty if all did.
+
+    Args:
+        model: the process model.
+        inputs: inputs of the training, shape (rows, n_u).
+    """
+    columns = zip(model.input_names, inputs.T, strict=True)
+    held = {name: float(column[0]) for name, column in columns if np.ptp(column) == 0.0}  # NaN is not equal to itself
+    hidden = [effect.name for effect in effects_of(model) if held and needs_moves(model, effect, held)]
+    if not hidden:
+        return []
+    levels = " and ".join(f"{name} ({level:g})" for name, level in held.items())
+    return [f"training: {levels} never moved, so these causes cannot be seen until it does: {', '.join(hidden)}"]
 
 
 def describe_uncertain(uncertain: Sequence[str]) -> str:

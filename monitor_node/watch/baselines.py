@@ -4,9 +4,10 @@ The modes that the training has seen, with rows enough, are judged by what was l
 plant starts up or shuts down, or one that the training has not seen, is watched by the signal checks only.
 
 A baseline changes by an operator's command (`reactor/{plant}/command/baseline`), and after the diagnosis of the
-training, whose rows are kept until then: it is learned again from them with the new model. A change holds from one row
-on, the next one, or the one that a recording names; it is published with the time of that row, so a replay does the
-same there.
+training, whose rows are kept until then: it is learned again from them with the new model. A command holds from the
+next row on, a diagnosis from the row that is `ANSWER_ROWS` after the training, whenever before it was done: so a
+back-test, where it is done at once, and a live monitor publish the same. A diagnosis that takes longer holds from the
+next row on. A change is published with the time of its row, so a replay does the same there.
 """
 
 from collections import deque
@@ -19,7 +20,14 @@ from monitor_node.health import NODE, Failures
 from monitor_node.learn.arx import ArxReference
 from monitor_node.learn.baseline import TrainingResult, learn_baseline
 from monitor_node.learn.training import Training
-from monitor_node.learn.training_diagnosis import FAILED, DiagnosisJob, Finding, equations_text, read_equations
+from monitor_node.learn.training_diagnosis import (
+    FAILED,
+    DiagnosisJob,
+    Finding,
+    describe_still_inputs,
+    equations_text,
+    read_equations,
+)
 from monitor_node.learn.training_rows import TrainingRows
 from monitor_node.watch.evaluation import Evaluation, EvaluationMemory
 from monitor_node.watch.operation import Operation
@@ -27,6 +35,7 @@ from reactorwatch.contract.codec import check_signature
 from reactorwatch.contract.messages_pb2 import Baseline, BaselineCommand
 from reactorwatch.diagnosis.result import NOMINAL
 from reactorwatch.errors import InputError
+from reactorwatch.process import own_effects
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.stored_state import Memory, copy_of
 
@@ -76,7 +85,7 @@ class Baselines:
         self._config, self._model, self._operation = config, model, operation
         self._evaluation, self._models = evaluation, evaluation.models
         self._failures, self._diagnose = failures, diagnose
-        self.training, self.update = Training(config, model, self._models), ModelUpdate(config, changes)
+        self.training, self.update = Training(config, model, self._models), ModelUpdate(config, model, changes)
         self.kept: list[EvaluationMemory] = []
         self.modes = ModesMemory([float("nan")] * len(config.modes))
 
@@ -99,15 +108,23 @@ class Baselines:
     # --- training --------------------------------------------------------------------------------------------
 
     def end_training(
-        self, time_ns: int, trained: TrainingResult, period_ns: float, units: Sequence[str]
+        self, time_ns: int, trained: TrainingResult, period_ns: float, units: Sequence[str], *, at_once: bool = False
     ) -> Baseline | None:
-        """Judge by what was learned from now on; returns the change of the model by the diagnosis of the training."""
+        """Judge by what was learned from now on; returns the change of the model that a recording has at this row.
+
+        Args:
+            time_ns: time of the row.
+            trained: what was learned.
+            period_ns: sampling period.
+            units: units of the outputs.
+            at_once: True to change the model now by the diagnosis of the training, as no row of this record follows.
+        """
         self.start(trained, period_ns)
-        if self._config.diagnose_training and equations_text(self._model):
+        if self._config.diagnose_training and self._model is not None:
             self.update.rows = trained.rows
         if self._diagnose is not None and (job := self.diagnosis_job) is not None:
             self.on_finding(self._diagnose(job))
-        change = self._change_model(time_ns, period_ns, units)
+        change = self._change_model(time_ns, period_ns, units, at_once=at_once)
         if change is None:
             self._check_training(trained, period_ns, units)
         return change
@@ -116,6 +133,8 @@ class Baselines:
         """Start to judge by what was learned."""
         self.modes.is_learned, self.modes.reference = True, trained.reference.kind
         self._evaluation.start(trained, period_ns, again=False)
+        if self._model is not None and trained.reference.follows_equations:
+            self._evaluation.notes += describe_still_inputs(self._model, trained.rows.arrays.inputs)
         self._operation.end_training()
 
     def _check_training(self, trained: TrainingResult, period_ns: float, units: Sequence[str]) -> None:
@@ -125,10 +144,10 @@ class Baselines:
     @property
     def diagnosis_job(self) -> DiagnosisJob | None:
         """The diagnosis of the training, while it is pending."""
-        return self.update.job(self._model)
+        return self.update.job
 
     def on_finding(self, finding: Finding) -> None:
-        """Process the result of a diagnosis; a change holds from the next row on."""
+        """Process the result of a diagnosis; see the module for the row from which on a change holds."""
         note, reference = self.update.resolve(finding), self._evaluation.reference
         if note and (finding.equations or (reference is not None and reference.follows_equations)):
             self._evaluation.notes.append(note)
@@ -137,7 +156,7 @@ class Baselines:
 
     def change(self, time_ns: int, period_ns: float, units: Sequence[str]) -> Baseline | None:
         """Execute the change that holds from a row on, and return it; None: there is none."""
-        if not is_command(self.update.changes[0]):
+        if not (self.update.changes and is_command(self.update.changes[0])):
             return self._change_model(time_ns, period_ns, units)
         change = self.update.pop_due(time_ns)
         if change is not None:
@@ -145,9 +164,13 @@ class Baselines:
             self._execute(change)
         return change
 
-    def _change_model(self, time_ns: int, period_ns: float, units: Sequence[str]) -> Baseline | None:
+    def _change_model(
+        self, time_ns: int, period_ns: float, units: Sequence[str], *, at_once: bool = False
+    ) -> Baseline | None:
         """Learn the baseline again with the model of a change, if one holds from this row on; returns it if so."""
         update, evaluation = self.update, self._evaluation
+        if at_once or evaluation.memory.rows_watched >= ANSWER_ROWS:
+            update.take_answer()
         if update.changes and is_command(update.changes[0]):
             return None
         change = update.pop_due(time_ns)
@@ -185,7 +208,7 @@ class Baselines:
     def equations_of(self, memory: EvaluationMemory) -> ProcessModel | None:
         """Process model of a baseline; None: there is none. The newest change may be of another mode."""
         change = memory.change
-        return self._model if change is None or not change.model else read_equations(change.model)
+        return self._model if change is None or not change.model else read_equations(change.model, self._model)
 
     def schedule(self, command: BaselineCommand) -> Baseline:
         """Schedule a command for the next row; returns the change.
@@ -205,7 +228,8 @@ class Baselines:
         restored = kept.get(change.restored) if change.what == RESTORE else None
         memory = self._evaluation.memory
         accepted = memory.incident if change.what == ACCEPT else None
-        memory.incident = self.update.rows = None
+        memory.incident = None
+        self.update.drop_training()
         if self._evaluation.reference is not None:
             replaced = self._keep()
             replaced.change = _change_of(replaced.change)
@@ -251,8 +275,9 @@ class Baselines:
         evaluation.leave_ordinary()
         evaluation.memory.incident, began_ns = None, training.memory.began_ns
         if (rows := self.update.rows) is not None:  # its finding would change the baseline of the next mode
+            self.update.answer = None
             self.on_finding(Finding(rows.times_ns[0], FAILED, "the plant changed its mode before the end"))
-            self.update.rows = None
+            self.update.drop_training()
         is_watched = evaluation.reference is not None
         if modes.is_judged and (is_watched or training.memory.rows.times):
             left = modes.others[_key_of(modes.mode)] = self._keep()
@@ -303,42 +328,67 @@ def _key_of(mode: list[float]) -> str:
     return ",".join(map(repr, mode))
 
 
+ANSWER_ROWS = 10
+"""Number of rows after a training from which on its diagnosis holds. As many come before the first look for causes. The
+reactor's takes a few seconds, less than a row of six seconds each."""
+
+
 class ModelUpdate:
     """Pending diagnosis of a plant's training, and the change that follows it.
 
     Attributes:
         changes: changes to come.
+        answer: change by the diagnosis of the training, until the row from which on it holds; None: there is none.
         rows: rows of the training until it was diagnosed and the change was made; None: there are none.
         baseline: the change in force; None: the plant is judged by the model as given.
     """
 
-    def __init__(self, config: MonitorConfig, changes: deque[Baseline]) -> None:
-        self._config = config
+    def __init__(self, config: MonitorConfig, model: ProcessModel | None, changes: deque[Baseline]) -> None:
+        self._config, self._model = config, model
         self._last_ns: int | None = None
         self.changes = changes
+        self.answer: Baseline | None = None
         self.rows: TrainingRows | None = None
         self.baseline: Baseline | None = None
 
-    def job(self, model: ProcessModel | None) -> DiagnosisJob | None:
+    @property
+    def job(self) -> DiagnosisJob | None:
         """The pending diagnosis; None: there is none."""
-        if self.rows is None or self.changes:
+        if not self.is_pending or self.rows is None or self._model is None:
             return None
-        return DiagnosisJob(self.rows, self._config.signals, equations_text(model))
+        effects, config = own_effects(self._model), self._config
+        causes, text = tuple(effect.name for effect in effects), equations_text(self._model)
+        return DiagnosisJob(self.rows, config.signals, text, config.process, causes, effects)
 
     @property
     def is_pending(self) -> bool:
         """True while a diagnosis is pending."""
-        return self.rows is not None and not self.changes
+        return self.rows is not None and not self.changes and self.answer is None
+
+    @property
+    def is_due(self) -> bool:
+        """True if a change may hold from the next row on."""
+        return bool(self.changes) or self.answer is not None
+
+    def take_answer(self) -> None:
+        """Let the diagnosis of the training hold from this row on; a command that comes first replaces the training."""
+        if self.answer is not None and not self.changes:
+            self.changes.append(self.answer)
+            self.answer = None
+
+    def drop_training(self) -> None:
+        """Drop the rows of the training, and what their diagnosis would change."""
+        self.rows = self.answer = None
 
     def resolve(self, finding: Finding) -> str:
-        """Process a finding: schedule the change for the next row; returns a note, empty if there is nothing to note.
+        """Process a finding, which may be a change to come; returns a note, empty if there is nothing to note.
 
         A finding of another training is ignored.
         """
-        if self.rows is None or self.changes or finding.first_ns != self.rows.times_ns[0]:
+        if self.rows is None or not self.is_pending or finding.first_ns != self.rows.times_ns[0]:
             return ""
         if finding.equations:
-            self.changes.append(finding.baseline)
+            self.answer = finding.baseline
             return f"{finding.why}; from then on the plant is judged by the equations with it"
         self.rows = None
         if finding.verdict == FAILED:
@@ -380,7 +430,9 @@ class ModelUpdate:
         """
         assert self.rows is not None
         rows, self.rows = self.rows, None
-        trained = learn_baseline(self._config, read_equations(change.model), models.copy(), rows, last_chance=True)
+        trained = learn_baseline(
+            self._config, read_equations(change.model, self._model), models.copy(), rows, last_chance=True
+        )
         if trained.refused or not trained.reference.follows_equations:
             return None
         self.baseline = change

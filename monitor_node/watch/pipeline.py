@@ -52,8 +52,9 @@ class PipelineMemory(Memory):
         modes: memory of the modes.
         kept: baselines that can be restored, the oldest first.
         change: newest change of a baseline, of any mode; None: there was none.
-        undiagnosed: rows of the training while its diagnosis is pending; None: it is not.
+        undiagnosed: rows of the training until its diagnosis holds; None: there are none.
         commands: changes by accepted commands that hold from the next row on, in order.
+        answer: change by the diagnosis of the training, until the row from which on it holds; None: there is none.
     """
 
     sampling: SamplingPeriod
@@ -65,6 +66,7 @@ class PipelineMemory(Memory):
     change: Baseline | None
     undiagnosed: TrainingRows | None
     commands: list[Baseline]
+    answer: Baseline | None = None
 
 
 class PlantPipeline:
@@ -141,6 +143,7 @@ class PlantPipeline:
             self.baselines.update.baseline,
             self.baselines.update.rows,
             self.baselines.update.commands,
+            self.baselines.update.answer,
         )
 
     def resume(self, memory: PipelineMemory, now_ns: int) -> None:
@@ -156,7 +159,8 @@ class PlantPipeline:
         self.operation.memory, self.training.memory = memory.operation, memory.training
         baselines.modes, baselines.kept, update.baseline = memory.modes, memory.kept, memory.change
         update.changes.extend(memory.commands)
-        update.rows = memory.undiagnosed if self._config.diagnose_training else None
+        if self._config.diagnose_training:
+            update.rows, update.answer = memory.undiagnosed, memory.answer
         self.evaluation.resume(memory.evaluation, baselines.equations_of(memory.evaluation), now_ns, follows=True)
 
     def resume_from_alarms(self) -> None:
@@ -184,7 +188,7 @@ class PlantPipeline:
     def update(self, row: Row, units: list[str], publications: list[Publication]) -> None:
         """Process a row, with the units of its outputs; publications before an error are published nevertheless."""
         baselines, evaluation = self.baselines, self.evaluation
-        if baselines.update.changes:
+        if baselines.update.is_due:
             self._change_baseline(row.time_ns, publications)
         if self._config.modes:
             baselines.follow_mode(self.operation.values)
@@ -392,7 +396,8 @@ class PlantPipeline:
         Raises:
             InputError: there are too few rows to learn from, or no output can be watched.
         """
-        self._end_training(time_ns, self.training.finish_early(), [])
+        trained, period_ns = self.training.finish_early(), self._sampling.period_ns
+        self.baselines.end_training(time_ns, trained, period_ns, self._units, at_once=True)
 
     def _end_training(self, time_ns: int, trained: TrainingResult, publications: list[Publication]) -> None:
         change = self.baselines.end_training(time_ns, trained, self._sampling.period_ns, self._units)

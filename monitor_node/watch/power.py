@@ -138,7 +138,7 @@ def _deviations(watch: Watch, rows: TrainingRows) -> list[Deviation]:
 
 
 def _causes(watch: Watch, arrays: RowArrays) -> list[Deviation]:
-    """Causes of the catalogue, to first order about the filter's run over the training."""
+    """Causes that are traced, to first order about the filter's run over the training."""
     plant, known_plant = watch.reference.plant, watch.reference.known_plant
     assert plant is not None
     assert known_plant is not None

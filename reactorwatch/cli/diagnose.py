@@ -97,9 +97,11 @@ def write_report(found: DiagnosisResult, file: Path, folder: Path, asked: Diagno
 
 
 def _write_experiment(experiment: Experiment, path: Path) -> None:
-    """Write the level from each change on, and at the end."""
-    time_min, level = np.array([*experiment.input, (experiment.span_min, experiment.input[-1][1])]).T
-    write_table(path, Record(time_min, {experiment.signal: level}, path.name))
+    """Write the levels of all inputs from each change on, and at the end."""
+    moves = experiment.input if isinstance(experiment.input, dict) else {experiment.signal: experiment.input}
+    time_min, level = np.array([*moves[experiment.signal], (experiment.span_min, moves[experiment.signal][-1][1])]).T
+    columns = {name: level if name == experiment.signal else np.full(level.size, moves[name][0][1]) for name in moves}
+    write_table(path, Record(time_min, columns, path.name))
 
 
 def diagnosis_jobs(

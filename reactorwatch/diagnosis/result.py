@@ -234,9 +234,9 @@ class Experiment(Result, frozen=True, kw_only=True):
 
     Attributes:
         why: the expected result, in a sentence.
-        input: (minute, value) of each change.
+        input: (minute, value) of each change; with several inputs by input, those at rest with one level.
         separates: explanations that it separates, each its causes joined by a plus.
-        signal: input that is moved; the others stay constant.
+        signal: input that is moved; the others rest.
         span_min: duration.
         expected_delta_bic: expected difference in BIC between the two nearest of them.
         probability: probability that this difference exceeds `LISTED`.
@@ -247,7 +247,7 @@ class Experiment(Result, frozen=True, kw_only=True):
     """
 
     why: str
-    input: tuple[tuple[float, float], ...]
+    input: tuple[tuple[float, float], ...] | dict[str, tuple[tuple[float, float], ...]]
     separates: tuple[str, ...]
     signal: str
     span_min: float

@@ -107,10 +107,12 @@ class ExtendedModel:
         """Copy with minutes counted from another time; unchanged where its own zero is unknown."""
         if not self.zero_ns:
             return self
-        by_min = (self.zero_ns - zero_ns) / 60_000_000_000
+        return replace(self.shift((self.zero_ns - zero_ns) / 60_000_000_000), zero_ns=zero_ns)
+
+    def shift(self, by_min: float) -> "ExtendedModel":
+        """Copy with the times of its effects later."""
         equations = None if self.equations is None else _shift(self.equations, by_min)
-        effects = tuple(item.shift(by_min) for item in self.effects)
-        return replace(self, effects=effects, zero_ns=zero_ns, equations=equations)
+        return replace(self, effects=tuple(item.shift(by_min) for item in self.effects), equations=equations)
 
     def to_object(self) -> dict[str, Any]:
         """Convert to the JSON object."""
@@ -218,6 +220,17 @@ def is_complete(extended: ExtendedModel, model: ProcessModel) -> bool:
         return are_named(extended) and fingerprint(replace(extended, equations=None).build()) == fingerprint(model)
     except InputError:
         return False
+
+
+def stored_model(model: ProcessModel) -> ExtendedModel:
+    """A model in the form that its file has: its name and effects where the catalogue makes it of them, else equations.
+
+    Effects that are code, which could be named as causes, are in no file.
+    """
+    extended = extended_model_of(model)
+    if is_complete(extended, model):
+        return extended
+    return ExtendedModel(model.name, equations=model, uncertain=model.uncertain)
 
 
 def _specification(effect: Effect, values: Mapping[str, float], prefix: str) -> FaultSpecification:

@@ -16,6 +16,7 @@ jumps and times of the model with either effect are compared at points within it
 name, or the code of an effect, does not matter.
 """
 
+from collections.abc import Mapping
 from functools import cached_property, lru_cache
 from typing import Any, ClassVar
 
@@ -351,6 +352,37 @@ def are_twins(one: EffectChanges, other: EffectChanges) -> bool:
         if a.lower <= size <= a.upper and b.lower <= factor * size <= b.upper and factor != 0.0
     ]
     return bool(sizes) and all(_agree(one.at(size), other.at(factor * size)) for size in sizes)
+
+
+def needs_moves(model: ProcessModel, effect: Effect, held: Mapping[str, float]) -> bool:
+    """Return true if an effect changes nothing while inputs are held, and something where they are elsewhere or move.
+
+    Args:
+        model: the process model.
+        effect: an effect on it; states that it adds are at rest.
+        held: levels of the inputs that are held, by name.
+    """
+    extended, x, u = effect.apply(model, size := ca.SX.sym("m")), *model.arguments()[:2]
+    added = [item.symbol for item in extended.states[len(model.states) :]]
+    at_rest = [extended.at_rest[item.name] for item in extended.states[len(model.states) :]]
+    shown = ca.vertcat(*extended.rhs[: len(model.states)], *(item.expression for item in extended.outputs))
+    shown = ca.substitute(shown, ca.vertcat(*added), ca.vertcat(*at_rest)) if added else shown
+    changed = ca.substitute(shown, size, effect.typical) - ca.substitute(shown, size, effect.neutral)
+    fixed = ca.vertcat(*(item.symbol for item in model.inputs if item.name in held))
+    levels = ca.vertcat(*(held[item.name] for item in model.inputs if item.name in held))
+    symbols = [x, u, extended.arguments()[2], extended.clock.now, extended.clock.middle]
+    function = ca.Function("changed", symbols, [ca.densify(ca.substitute(changed, fixed, levels)), ca.densify(changed)])
+    for number in range(POINTS):
+        rng = np.random.default_rng([2, number])
+        point = ([rng.uniform(item.lower, item.upper) for item in items] for items in (model.states, model.inputs))
+        then, elsewhere = (np.nan_to_num(np.array(item)) for item in function(*point, extended.values(), 0.0, 0.0))
+        if np.any(np.abs(then) > 1e-9 * (1.0 + np.abs(elsewhere))):
+            return False
+        if not added and np.any(elsewhere):
+            return True
+    others = ca.vertcat(x, *(item.symbol for item in model.inputs if item.name not in held))
+    follows = ca.vertcat(*at_rest) if added else ca.SX(0)
+    return bool(ca.depends_on(follows, fixed)) and not ca.depends_on(follows, others)
 
 
 @lru_cache(maxsize=64)

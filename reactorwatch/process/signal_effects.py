@@ -279,9 +279,10 @@ class OutputDelay(SensorEffect):
 class StuckOutput(SensorEffect):
     """The share m of the reading stays at a constant value: 1 is a sensor that is stuck.
 
-    The constant is a parameter of the extended model.
+    The constant is a parameter of the extended model. A monitor finds a stuck sensor by its repeated values.
     """
 
+    is_traced = False
     unit = "1"
     lower = 0.0
     upper = 1.0
@@ -324,6 +325,7 @@ class InputTiming(Effect):
     later, and the onsets of the others are in that model's time.
     """
 
+    is_traced = False
     location = TIMING
     unit = "min"
     lower = 0.0

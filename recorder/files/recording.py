@@ -36,8 +36,8 @@ from reactorwatch.contract import keys
 from reactorwatch.description.process import KnownParameter, Process, Signal, describe_model
 from reactorwatch.errors import InputError
 from reactorwatch.limits import parse_json
-from reactorwatch.process import EFFECTS_OF
-from reactorwatch.process.extended_model import ExtendedModel, extended_model_of, is_complete, parse_extended_model
+from reactorwatch.process import own_effects
+from reactorwatch.process.extended_model import parse_extended_model, stored_model
 from reactorwatch.records.decode import list_files
 from reactorwatch.records.record import Record
 from reactorwatch.runtime.reorder_buffer import Gap
@@ -132,15 +132,14 @@ def _equations_metadata(process: Process) -> dict[str, str]:
     model = process.equations
     if model is None or model.breakpoints:  # times of deviations count from a zero that is not known here
         return {}
-    extended = extended_model_of(model)
-    if not (is_complete(extended, model) and process.effects == EFFECTS_OF.get(model.name, ())):
-        if process.effects:
-            return {}
-        extended = ExtendedModel(model.name, equations=model, uncertain=model.uncertain)
+    extended = stored_model(model)
+    if process.effects != (own_effects(model) if extended.equations is None else ()):
+        return {}
     given = {name: KnownParameter.of(item) for name, item in process.parameters.items()}
     return {
         "equations": msgspec.json.encode(extended.to_object()).decode(),
         "parameters": msgspec.json.encode(given).decode(),
+        **({"generic": "true"} if process.generic else {}),
     }
 
 
@@ -155,7 +154,12 @@ def _with_equations(process: Process, metadata: dict[str, str]) -> Process:
     named = describe_model(parse_extended_model(metadata["equations"]).build())
     parameters = msgspec.convert(parse_json(metadata["parameters"]), dict[str, KnownParameter])
     return replace(
-        named, name=process.name, signals=process.signals, parameters=parameters, file_format=process.file_format
+        named,
+        name=process.name,
+        signals=process.signals,
+        parameters=parameters,
+        file_format=process.file_format,
+        generic="generic" in metadata,
     )
 
 

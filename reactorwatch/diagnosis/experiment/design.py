@@ -6,6 +6,9 @@ the rest, the best maximises the evidence between the pair that it separates lea
 (`reactorwatch.diagnosis.experiment.predictions` defines the evidence). Pairs that no input separates, such as exact
 twins, do not count, and are reported.
 
+One input is moved, and the others rest: the one that separates the most pairs and, among equals, the pair that is
+separated least the furthest in the same time.
+
 The design is a pattern of `PATTERN_ROWS` rows. It is repeated until every pair is decided with the probability `SURE`:
 at least `FEWEST` times, since in a short record more than these alternatives can be confused, and at most `MOST` times.
 """
@@ -71,41 +74,69 @@ def propose_experiment(
         noise: noise levels of the plant and its sensors.
         given: limits by signal.
     """
+    if not model.inputs:
+        return "No experiment is proposed: the process has no input that could be moved."
     predictions = Predictions(hypotheses[:MOST_ALTERNATIVES], run, model, noise, given, PATTERN_ROWS)
-    return _ExperimentSearch(predictions, model).search()
+    searches = [_ExperimentSearch(predictions, model, index) for index in range(len(model.inputs))]
+    searches, limits = [item for item in searches if item.trials], _describe_limits(predictions, model)
+    if not searches:
+        names = _list_names(model.input_names)
+        return f"No experiment is proposed: {limits} leave {names} no room to move."
+    in_reach = [item for item in searches if np.any(item.in_reach)]
+    found: list[Experiment | None] = []
+    for item in sorted(in_reach, key=_ExperimentSearch.reach, reverse=True):
+        found.append(item.design())
+        if (experiment := found[-1]) is not None and experiment.expected_delta_bic >= LISTED:
+            return experiment
+    if None in found:
+        return f"No experiment is proposed: the outputs do not keep {limits} for long enough."
+    labels, longest_min = [item.label for item in predictions.members], MOST * PATTERN_ROWS * predictions.period_min
+    return (
+        f"No experiment with {_list_names(model.input_names, 'or')} can tell {_list_names(labels)} apart within "
+        f"{limits}, not even in {longest_min:.4g} min."
+    )
 
 
 class _ExperimentSearch:
-    """Search for the input that separates alternatives best."""
+    """Search for the sequence of one input that separates alternatives best.
 
-    def __init__(self, alternatives: Predictions, model: ProcessModel) -> None:
-        self._alternatives, self._model = alternatives, model
-        self._ends = InputRange(*(alternatives.limits[model.input_names[0]]), alternatives.rest)
+    Attributes:
+        trials: initial sequences, as large as the outputs allow.
+        in_reach: for each pair of alternatives, True if the longest experiment is likely to separate it.
+    """
+
+    def __init__(self, alternatives: Predictions, model: ProcessModel, moved: int) -> None:
+        self._alternatives, self._model, self._moved = alternatives, model, moved
+        self._ends = InputRange(*alternatives.limits[model.input_names[moved]], float(alternatives.rest[moved]))
         self._ends = self._possible_ends()
-
-    def search(self) -> Experiment | str:
-        """Find the best experiment, or the reason why there is none."""
         trials = (self._evaluate_within_limits(sequence) for sequence in initial_sequences(PATTERN_ROWS))
-        tried = [item for item in trials if item is not None]
-        if not tried:
-            name = self._model.input_names[0]
-            return f"No experiment is proposed: {self._describe_limits()} leave {name} no room to move."
-        most = MOST * np.max([item.evidence for item in tried], axis=0)
-        in_reach = np.array([decision_probability(evidence, evidence) >= LIKELY for evidence in most.tolist()])
-        if not np.any(in_reach):
-            in_reach = most >= LISTED
-        if not np.any(in_reach):
-            return self._describe_failure()
-        best = self._improve(max(tried, key=lambda item: _score(item, in_reach)), in_reach)
+        self.trials = [item for item in trials if item is not None]
+        self.in_reach = np.zeros(len(alternatives.pairs), dtype=bool)
+        if self.trials:
+            most = MOST * np.max([item.evidence for item in self.trials], axis=0)
+            self.in_reach = np.array([decision_probability(value, value) >= LIKELY for value in most.tolist()])
+            if not np.any(self.in_reach):
+                self.in_reach = most >= LISTED
+
+    def reach(self) -> tuple[int, float]:
+        """Number of pairs in reach, and the evidence of the one that the best sequence separates least."""
+        return int(np.sum(self.in_reach)), _score(self._best_trial(), self.in_reach)
+
+    def _best_trial(self) -> _Trial:
+        return max(self.trials, key=lambda item: _score(item, self.in_reach))
+
+    def design(self) -> Experiment | None:
+        """Design the experiment; None if the outputs do not keep their limits for long enough."""
+        best = self._improve(self._best_trial(), self.in_reach)
         for share in SMALLER:  # a sine meets the second pattern in another phase
-            noncentralities = self._size_experiment(best.sequence.shrink(share), in_reach)
-            if noncentralities is not None:
-                return noncentralities if noncentralities.expected_delta_bic >= LISTED else self._describe_failure()
-        return f"No experiment is proposed: the outputs do not keep {self._describe_limits()} for long enough."
+            found = self._size_experiment(best.sequence.shrink(share), self.in_reach)
+            if found is not None:
+                return found
+        return None
 
     def _size_experiment(self, sequence: InputSequence, in_reach: Array) -> Experiment | None:
         """Repeat the pattern as often as needed, each with the same evidence; None if outputs leave their limits."""
-        runs = self._alternatives.runs(self._levels(sequence, FEWEST))
+        runs = self._alternatives.runs(self._levels(sequence, FEWEST), self._moved)
         if runs is None:
             return None
         noncentralities = self._alternatives.noncentralities(runs)
@@ -117,7 +148,7 @@ class _ExperimentSearch:
             if all(item.probability >= SURE for item, wanted in zip(apart, in_reach.tolist(), strict=True) if wanted):
                 break
         levels = self._levels(sequence, times)
-        runs = self._alternatives.runs(levels)
+        runs = self._alternatives.runs(levels, self._moved)
         return None if runs is None else self._experiment(levels, runs, apart)
 
     def _experiment(self, levels: Array, runs: Sequence[Run], apart: Sequence[Separation]) -> Experiment:
@@ -127,7 +158,7 @@ class _ExperimentSearch:
         hardest = min(decided, key=lambda item: item.expected_delta_bic)
         names = dict.fromkeys(name for item in decided for name in item.between)
         changes = np.flatnonzero(np.diff(levels, prepend=np.nan))
-        item = self._model.inputs[0]
+        item = self._model.inputs[self._moved]
         span_min = self._alternatives.period_min * levels.size
         undecided = [self._list_labels(item.between) for item in apart if item not in decided]
         but = f" (but not between {', nor between '.join(undecided)})" if undecided else ""
@@ -144,9 +175,12 @@ class _ExperimentSearch:
             alternative.name: dict(zip(self._model.output_names, run.measured.T, strict=True))
             for alternative, run in zip(self._alternatives.members, runs, strict=True)
         }
+        moves = tuple((round(float(time_min[row]), 6), float(levels[row])) for row in changes.tolist())
+        resting = zip(self._model.input_names, self._alternatives.rest.tolist(), strict=True)
+        by_input = {name: ((0.0, level),) for name, level in resting} | {item.name: moves}
         return Experiment(
             why=why,
-            input=tuple((round(float(time_min[row]), 6), float(levels[row])) for row in changes.tolist()),
+            input=moves if len(by_input) == 1 else by_input,
             separates=tuple(names),
             expected_delta_bic=hardest.expected_delta_bic,
             probability=hardest.probability,
@@ -169,7 +203,7 @@ class _ExperimentSearch:
             sequence = staircase(ROWS_A_STEP, STEPS, towards)
             for steps in range(STEPS, -1, -1):
                 levels = sequence.first(steps).levels(ends, QUIET_ROWS + steps * ROWS_A_STEP)
-                if not steps or self._alternatives.runs(levels) is not None:
+                if not steps or self._alternatives.runs(levels, self._moved) is not None:
                     break
             reached.append(steps / STEPS)
         low, high = (float(value) for value in ends.levels(np.array([-reached[0], reached[1]])))
@@ -191,7 +225,7 @@ class _ExperimentSearch:
         None if the outputs leave their limits, or a pair has no more evidence than `least`.
         """
         levels = self._levels(sequence, 1)
-        runs = self._alternatives.runs(levels)
+        runs = self._alternatives.runs(levels, self._moved)
         if runs is None or np.ptp(levels) == 0.0:
             return None
         evidence = np.zeros(len(self._alternatives.pairs)) if expected is None else expected.copy()
@@ -228,23 +262,23 @@ class _ExperimentSearch:
         """Levels of repeated patterns."""
         return np.tile(sequence.levels(self._ends, PATTERN_ROWS), times)
 
-    def _describe_failure(self) -> str:
-        them = self._list_labels(alternative.name for alternative in self._alternatives.members)
-        return (
-            f"No experiment with {self._model.input_names[0]} can tell {them} apart within {self._describe_limits()}, "
-            f"not even in {MOST * PATTERN_ROWS * self._alternatives.period_min:.4g} min."
-        )
-
     def _list_labels(self, names: Iterable[str]) -> str:
         labels = {alternative.name: alternative.label for alternative in self._alternatives.members}
-        *first, last = (labels[name] for name in names)
-        return f"{', '.join(first)} and {last}" if first else last
+        return _list_names([labels[name] for name in names])
 
-    def _describe_limits(self) -> str:
-        units = {item.name: item.unit for item in self._model.inputs[:1]}
-        units |= {item.name: item.unit for item in self._model.outputs}
-        parts = [f"{name} {_range(self._alternatives.limits[name])} {unit}" for name, unit in units.items()]
-        return f"the limits ({', '.join(parts)})"
+
+def _list_names(names: Sequence[str], word: str = "and") -> str:
+    """Names in words.
+
+    >>> _list_names(["q", "P", "u"], "or")
+    'q, P or u'
+    """
+    return f" {word} ".join(filter(None, (", ".join(names[:-1]), *names[-1:])))
+
+
+def _describe_limits(alternatives: Predictions, model: ProcessModel) -> str:
+    parts = [f"{name} {_range(alternatives.limits[name])} {unit}" for name, unit in model.units.items()]
+    return f"the limits ({', '.join(parts)})"
 
 
 def _score(item: _Trial, in_reach: Array) -> float:

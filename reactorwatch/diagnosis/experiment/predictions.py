@@ -133,7 +133,7 @@ class Prediction:
 
 
 class Predictions:
-    """Explanations of one record, extrapolated with other levels of the first input.
+    """Explanations of one record, extrapolated with other levels of an input.
 
     Args:
         hypotheses: hypotheses fitted to the record.
@@ -146,7 +146,7 @@ class Predictions:
     Attributes:
         pairs: indices of every two of them.
         limits: limits of every signal.
-        rest: level of the first input at which the plant settles before, its median in the record.
+        rest: level of each input at which the plant settles before, about its median in the record, shape (n_u,).
         period_min: sampling period.
     """
 
@@ -163,27 +163,32 @@ class Predictions:
         self._margin = MARGIN_SD * noise.sensor_sd(model.output_names)
         self.limits: Limits = limits_of(run, model, given)
         self.period_min = run.period_min
-        low, high = self.limits[model.input_names[0]]
-        self._resting = np.median(run.inputs, axis=0)
-        rest = min(max(float(self._resting[0]), low), high)
-        self._resting[0] = self.rest = float(InputRange(low, high, rest).levels(np.zeros(1))[0])
+        self.rest = np.array(
+            [
+                InputRange(low, high, min(max(float(usual), low), high)).levels(np.zeros(1))[0]
+                for usual, (low, high) in zip(
+                    np.median(run.inputs, axis=0), (self.limits[name] for name in model.input_names), strict=True
+                )
+            ]
+        )
         for item in hypotheses:
             item.hypothesis.filter.noise = noise
         pattern_min = pattern_rows * self.period_min
         self.members = tuple(
-            Prediction(item.hypothesis, item.fit, run, self._resting, REST_ROWS, pattern_min) for item in hypotheses
+            Prediction(item.hypothesis, item.fit, run, self.rest, REST_ROWS, pattern_min) for item in hypotheses
         )
         self.pairs = list(combinations(range(len(self.members)), 2))
 
-    def runs(self, levels: Array) -> list[Run] | None:
+    def runs(self, levels: Array, moved: int = 0) -> list[Run] | None:
         """Noise-free records that each predicts; None if an output of any leaves its limits.
 
         Args:
-            levels: levels of the first input, shape (rows,).
+            levels: levels of the input that is moved, shape (rows,).
+            moved: index of the input that is moved.
         """
         time_min = self.members[0].start_min + self.period_min * np.arange(levels.size, dtype=np.float64)
-        inputs = np.tile(self._resting, (levels.size, 1))
-        inputs[:, 0] = levels
+        inputs = np.tile(self.rest, (levels.size, 1))
+        inputs[:, moved] = levels
         result = []
         for alternative in self.members:
             outputs = alternative.predict_outputs(time_min, inputs)

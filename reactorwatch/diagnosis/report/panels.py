@@ -82,7 +82,8 @@ def experiment(proposed: Experiment, model: ProcessModel) -> list[Panel]:
     curves = proposed.curves
     if curves is None:
         raise ValueError("an experiment without its curves cannot be drawn")
-    times, first, item = curves.time_min, next(iter(curves.outputs)), model.inputs[0]
+    times, first = curves.time_min, next(iter(curves.outputs))
+    item = next(item for item in model.inputs if item.name == proposed.signal)
     limits = {
         name: [Line("limits", times, np.full(times.size, end), "limit") for end in proposed.limits[name]]
         for name in (item.name, *model.output_names)

@@ -373,7 +373,7 @@ EFFECTS: tuple[Effect, ...] = (
                 is_traced=False),
     Bypass(),
     Volume(),
-    InputTiming(name="sample_timing", label="coolant flow stamped late, or interpolated", is_traced=False,
+    InputTiming(name="sample_timing", label="coolant flow stamped late, or interpolated",
                 larger="coolant flow stamped {} min too late"),
 )
 # fmt: on

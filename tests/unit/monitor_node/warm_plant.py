@@ -31,10 +31,6 @@ def publish(monitor: Monitor, messages: Sequence[Encoded]) -> list[Publication]:
     return [item for message in messages for item in monitor.on_message(message, 0)]
 
 
-def without_baseline(publications: list[Publication]) -> list[Publication]:
-    return [item for item in publications if not isinstance(item.message, Baseline)]
-
-
 def changes(publications: list[Publication]) -> list[Baseline]:
     return [item.message for item in publications if isinstance(item.message, Baseline)]
 

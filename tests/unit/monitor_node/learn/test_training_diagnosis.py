@@ -12,6 +12,7 @@ from monitor_node.learn.process_reference import ProcessReference
 from monitor_node.learn.training_diagnosis import FAILED, DiagnosisJob, equations_text, read_equations
 from monitor_node.replay import backtest
 from monitor_node.replay.verification import verify
+from monitor_node.watch.baselines import ANSWER_ROWS
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import Encoded, Publication, encode, encode_message
 from reactorwatch.contract.messages_pb2 import Baseline, BaselineCommand, Sample
@@ -24,7 +25,7 @@ from reactorwatch.process.library.cstr import cstr
 from reactorwatch.process.model import fingerprint
 from reactorwatch.records.record import MINUTE_NS
 
-from ..warm_plant import CONFIG, GIVEN, LATE, TRAINED, Run, changes, plant, publish, without_baseline
+from ..warm_plant import CONFIG, GIVEN, LATE, TRAINED, Run, changes, plant, publish
 
 START_NS = 1_750_000_000 * 10**9
 SECOND_NS = 10**9
@@ -124,12 +125,41 @@ def test_a_monitor_that_resumes_after_the_change_continues_bit_for_bit_without_a
     assert published == warm.published[-len(published) :]
 
 
-def test_a_finding_before_the_first_row_gives_what_the_extended_model_gives(warm: Run) -> None:
+def watch_with_answer_after(warm: Run, rows: int, *, stopped: bool = False) -> list[Publication]:
+    """Publications where the diagnosis answers some rows after the training; stopped: the monitor resumes then."""
+    monitor, answered = Monitor(CONFIG, 0), TRAINED + 3 * (1 + rows)
+    published = publish(monitor, warm.messages[:answered])
+    monitor.pipeline.baselines.on_finding(warm.finding)
+    if stopped:
+        state, monitor = monitor.to_bytes(), Monitor(CONFIG, 0)
+        monitor.from_bytes(state)
+        monitor.on_history_end()
+    return published + publish(monitor, warm.messages[answered:])
+
+
+def test_an_answer_within_the_allowed_rows_holds_from_the_same_row_on_whenever_it_comes(warm: Run) -> None:
+    """So a back-test, where it is there at once, and live monitors publish the same, even after a restart."""
     at_once = publish(Monitor(CONFIG, 0, diagnose=lambda _: warm.finding), warm.messages)
-    extended = publish(Monitor(GIVEN, 0, model=read_equations(warm.finding.equations)), warm.messages)
     (change,) = changes(at_once)
-    assert change.time_ns == 40_000_000_000 * 60
-    assert without_baseline(at_once) == extended
+    assert change.time_ns == (40 * 60 + 6 * ANSWER_ROWS) * SECOND_NS
+    for rows, stopped in ((0, False), (4, True), (ANSWER_ROWS - 1, False)):
+        assert watch_with_answer_after(warm, rows, stopped=stopped) == at_once
+
+
+def test_a_later_answer_holds_from_the_next_row_on_which_a_replay_reads_from_the_recording(warm: Run) -> None:
+    late = watch_with_answer_after(warm, ANSWER_ROWS + 5)
+    (change,) = changes(late)
+    assert change.time_ns == (40 * 60 + 6 * (ANSWER_ROWS + 6)) * SECOND_NS
+    again = Monitor(CONFIG, 0)
+    again.schedule(change)
+    assert publish(again, warm.messages) == late
+
+
+def test_a_training_on_another_record_is_judged_by_what_its_diagnosis_found_from_the_first_row_on(warm: Run) -> None:
+    trained = backtest.train(warm.messages[:TRAINED], CONFIG)
+    found = backtest.run(warm.messages[TRAINED:], CONFIG, trained=trained)
+    assert found.baseline is not None
+    assert not found.raised_alarms
 
 
 @pytest.mark.parametrize("verdict", [NOMINAL, "unknown", FAILED])
@@ -165,17 +195,17 @@ def test_a_state_of_a_monitor_that_diagnoses_no_training_is_read_by_one_that_doe
     assert publish(again, warm.messages[LATE + 60 :]) == publish(monitor, warm.messages[LATE + 60 :])
 
 
-def test_only_models_that_the_catalogue_makes_are_diagnosed() -> None:
-    assert equations_text(cstr())
-    assert equations_text(replace(cstr(), name="other")) == ""
-    assert equations_text(replace(cstr(), breakpoints=("V",))) == ""
-    assert equations_text(None) == ""
+def test_a_model_that_the_catalogue_does_not_make_travels_with_its_equations() -> None:
+    assert "equations" not in msgspec.json.decode(equations_text(cstr()))
+    for other in (replace(cstr(), name="other"), replace(cstr(), breakpoints=("V",))):
+        assert fingerprint(read_equations(equations_text(other))) == fingerprint(replace(other, effects=()))
 
 
 def test_a_backtest_judges_a_sound_plant_by_what_it_was_before(warm: Run) -> None:
     found, given = backtest.run(warm.messages, CONFIG), backtest.run(warm.messages, GIVEN)
     assert found.baseline is not None
-    assert found.baseline.from_min == found.trained_until_min
+    assert found.trained_until_min is not None
+    assert found.baseline.from_min == pytest.approx(found.trained_until_min + 0.1 * ANSWER_ROWS)
     assert given.baseline is None
     assert not found.raised_alarms
     assert given.samples == found.samples
