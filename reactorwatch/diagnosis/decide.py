@@ -7,7 +7,7 @@
 | with nuisance, no cause is better than none by `LEAST_GAIN` | nominal | right |
 | with nuisance, what is left without a cause is within the tolerance, and the cause is there from the beginning, \
 changes the outputs by less than half of it or removes less than 0.8 | nominal | right |
-| a law explains it, nuisance alone leaves more than 0.3 of the tolerance, and no cause but a curve removes 95 % | \
+| a law explains it, nuisance alone leaves more than 0.3 of the tolerance, and no cause with an onset removes 95 % | \
 unknown | see below |
 | the best cause with nuisance removes at least half | named, or ambiguous | explained or mostly |
 | otherwise, without nuisance | named, or ambiguous with a rival within `SURE` | explained or mostly |
@@ -177,7 +177,7 @@ def decide(
     is_right = best.lead < LEAST_GAIN or (none.left <= 1.0 and is_small)
     if is_right and (none.left <= SMALL_LEFT or not is_law):
         return Verdict(NOMINAL, RIGHT, with_nuisance=True)
-    if is_law and (best.share < EXPLAINS or best.profile == FREE_NAME):
+    if is_law and (best.share < EXPLAINS or best.profile in (CONSTANT.name, FREE_NAME)):
         return Verdict(verdict, grade_of(verdict, max(item.share for item in graded), left))
     if best.share >= MOST:
         rivals = [item for item in graded[1:] if best.lead - item.lead < LISTED and item.share >= MOST]

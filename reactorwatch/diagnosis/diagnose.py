@@ -62,7 +62,6 @@ from reactorwatch.diagnosis.result import (
     UNKNOWN,
     Adequacy,
     Alternative,
-    Cause,
     Curves,
     Diagnosis,
     Gain,
