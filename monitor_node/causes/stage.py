@@ -67,8 +67,8 @@ def preparation(config: MonitorConfig, model: ProcessModel | None) -> Iterator[N
 
 
 def has_causes(config: MonitorConfig, model: ProcessModel) -> bool:
-    """Return true if causes are searched with this model: it has some, and the plant is driven."""
-    return config.isolation and bool(model.inputs and causes_of(model))
+    """Return true if causes are searched with this model: the settings want it, and it has some."""
+    return config.isolation and bool(causes_of(model))
 
 
 class ReconstructionMemory(Memory):
