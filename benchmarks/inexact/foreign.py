@@ -148,7 +148,10 @@ def draw(seed: int, number: int, sound: bool) -> Drawn:
         actual[onset:, list(plant["inputs"]).index(place)] *= 1.0 + size
     else:
         after[place] += size if place == "Ta" else size * before[place]
-    measured = SIMULATORS[name]([(before, actual[:onset]), (after, actual[onset:])], noise)
+    try:
+        measured = SIMULATORS[name]([(before, actual[:onset]), (after, actual[onset:])], noise)
+    except ModuleNotFoundError as error:
+        raise InputError(f"{name} needs {error.name}; run `pip install --group peers`") from error
     columns = {"time_s": plant["period_s"] * np.arange(ROWS, dtype=np.float64)}
     columns |= dict(zip(plant["inputs"], inputs[SETTLING_ROWS:].T, strict=True))
     columns |= dict(zip(plant["noise"], measured[SETTLING_ROWS:].T, strict=True))

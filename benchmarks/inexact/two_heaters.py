@@ -10,7 +10,6 @@ as their product. All other causes differ in the equations: `Q1.offset` and `T1.
 that is colder takes heat that does not grow with the temperature, and `T1.gain` is no bias.
 """
 
-import re
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -24,6 +23,9 @@ KINDS = ("skew", "moves", "lag", "constants", "capacity", "quantised")
 PAIRS = tuple(combinations(KINDS, 2))
 CAUSES = ("more loss", "less loss", "weaker heater", "stronger heater", "bias", "colder room")
 
+NOMINAL = np.array([10.0, 23.0, 0.01, 0.0075])
+"""U, Ta, alpha1 and alpha2 of the page."""
+
 PERIOD_S, ROWS, NOISE_K = 2.0, 1200, 0.1
 SETTLING_S = 1800.0
 """Time with the first powers before the first row: some fourteen time constants of a body."""
@@ -32,11 +34,9 @@ PAGE = Path(__file__).parents[2] / "docs" / "processes.md"
 
 
 def process_file() -> str:
-    """The process file of the page, as a user copies it."""
-    found = re.search(r"<!-- run: file tclab\.py -->\n```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL)
-    if found is None:
-        raise ValueError(f"{PAGE.name} must hold the file tclab.py after its mark")
-    return found.group(1)
+    """Text of the page's process file, as a user copies it."""
+    _, _, rest = PAGE.read_text(encoding="utf-8").partition("<!-- run: file tclab.py -->\n```python\n")
+    return rest.partition("```")[0]
 
 
 def kinds_of(seed: int, number: int) -> tuple[str, ...]:
@@ -54,14 +54,13 @@ def draw(seed: int, number: int, sound: bool) -> Drawn:
     kinds, end_s = kinds_of(seed, number), PERIOD_S * ROWS
     off_by: dict[str, float] = {}
 
-    def off(kind: str, name: str, nominal: float = 1.0) -> float:
+    def off(kind: str, name: str) -> float:
         if kind in kinds:
             off_by[name] = float(rng.choice((-0.05, 0.05)))
-        return nominal * (1.0 + off_by.get(name, 0.0))
+        return 1.0 + off_by.get(name, 0.0)
 
-    plant = np.array([off("constants", "U", 10.0), 23.0, off("constants", "alpha1", 0.01)])
-    plant = np.append(plant, off("constants", "alpha2", 0.0075))
-    heat_capacity = off("capacity", "heat capacity", 0.004 * 500.0)
+    plant = NOMINAL * [off("constants", "U"), 1.0, off("constants", "alpha1"), off("constants", "alpha2")]
+    heat_capacity = 0.004 * 500.0 * off("capacity", "heat capacity")
     grid = None if "moves" in kinds else PERIOD_S
     moves = [draw_moves(rng, end_s, (180.0, 480.0), (10.0, 80.0), grid) for _ in range(2)]
     onset_s = float(rng.uniform(0.3, 0.7) * end_s)
@@ -110,18 +109,18 @@ def _draw_cause(
     faulty, bias = plant.copy(), np.zeros(2)
     which, onset_min = int(rng.integers(2)), onset_s / 60.0
     if kind == "bias":
-        size = float(rng.choice((-1.0, 1.0)) * rng.uniform(1.0, 3.0))
-        bias[which] = size
-        return Cause((f"T{which + 1}.bias",), (size,), "degC", onset_min), faulty, bias
+        bias[which] = rng.choice((-1.0, 1.0)) * rng.uniform(1.0, 3.0)
+        return Cause((f"T{which + 1}.bias",), (float(bias[which]),), "degC", onset_min), faulty, bias
     if kind == "colder room":
         fall = float(rng.uniform(2.0, 5.0))
         faulty[1] -= fall
         return Cause(("Ta.deviation",), (-fall,), "degC", onset_min), faulty, bias
     sign = 1.0 if kind in ("more loss", "stronger heater") else -1.0
-    is_loss = kind.endswith("loss")
-    size = float(sign * (rng.uniform(0.20, 0.35) if is_loss else rng.uniform(0.10, 0.25)))
-    place, nominal = (0, 10.0) if is_loss else (2 + which, (0.01, 0.0075)[which])
-    faulty[place] *= 1.0 + size
-    names = ("U.deviation",) if is_loss else (f"alpha{which + 1}.deviation", f"Q{which + 1}.gain")
-    of_nominal = float(size * plant[place] / nominal)
-    return Cause(names, (size, of_nominal), "1", onset_min), faulty, bias
+    names: tuple[str, ...]
+    if kind.endswith("loss"):
+        constant, names, size = 0, ("U.deviation",), sign * rng.uniform(0.20, 0.35)
+    else:
+        constant, names = 2 + which, (f"alpha{which + 1}.deviation", f"Q{which + 1}.gain")
+        size = sign * rng.uniform(0.10, 0.25)
+    faulty[constant] *= 1.0 + size
+    return Cause(names, (size, float(size * plant[constant] / NOMINAL[constant])), "1", onset_min), faulty, bias
