@@ -20,7 +20,7 @@ from math import isfinite, nan, sqrt
 
 from monitor_node.alarms.alarms import STUCK_SENSOR, SuspectedCause
 from monitor_node.alarms.annunciator import Annunciator
-from monitor_node.causes.isolation import Isolation, causes_of
+from monitor_node.causes.isolation import UNKNOWN, Isolation, causes_of
 from monitor_node.causes.scan import Progress
 from monitor_node.causes.window import MOST_PIECES, RecentRows, Row, is_break, newest_rows, rows_since_break
 from monitor_node.config import MonitorConfig
@@ -67,8 +67,20 @@ def preparation(config: MonitorConfig, model: ProcessModel | None) -> Iterator[N
 
 
 def has_causes(config: MonitorConfig, model: ProcessModel) -> bool:
-    """Return true if causes are searched with this model: it has some, and the plant is driven."""
-    return config.isolation and bool(model.inputs and causes_of(model))
+    """Return true if causes are searched with this model: the settings want it, and it has some."""
+    return config.isolation and bool(causes_of(model))
+
+
+def select_likely(suspects: Sequence[SuspectedCause]) -> list[SuspectedCause]:
+    """Select the suspects that are published, of those that are given likeliest first.
+
+    These are the ones with a probability of 1 % and, of the two likeliest causes, each with 1 % if it is a cause: of
+    a plant that is not quite its model `UNKNOWN` has nearly all of the probability soon, whatever the cause.
+    """
+    causes = [item for item in suspects if item.cause != UNKNOWN]
+    least = 0.01 * sum(item.probability for item in causes)
+    nearest = [item.cause for item in causes[:2] if item.probability >= least > 0.0]
+    return [item for item in suspects if item.probability >= 0.01 or item.cause in nearest]
 
 
 class ReconstructionMemory(Memory):
@@ -248,8 +260,7 @@ class Suspicion:
         isolation.fitter.progress = self.memory.progress
         suspects = isolation.suspects(self._rows_of_look(since), min(since, FEW_ROWS))
         self.memory.progress = isolation.fitter.progress
-        shown = [item for item in suspects if item.probability >= 0.01]
-        self._board.set_suspects(shown, stopped=isolation.stopped)
+        self._board.set_suspects(select_likely(suspects), stopped=isolation.stopped)
         self._follow(suspects[0])
 
     def add(self, time_min: float, inputs: Sequence[float], values: Sequence[float]) -> Sequence[float]:

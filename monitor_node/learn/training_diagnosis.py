@@ -207,7 +207,7 @@ def equations_text(model: ProcessModel) -> str:
 def read_equations(text: str, given: ProcessModel | None = None) -> ProcessModel:
     """The model in `Baseline.model`, its clock that of samples on the bus: minutes since 1970-01-01 UTC.
 
-    It is the same object for the same text: what is prepared for one is prepared for all.
+    It is the same object for the same text and process: what is prepared for one is prepared for all.
 
     Args:
         text: the JSON.

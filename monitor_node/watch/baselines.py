@@ -120,7 +120,7 @@ class Baselines:
             at_once: True to change the model now by the diagnosis of the training, as no row of this record follows.
         """
         self.start(trained, period_ns)
-        if self._config.diagnose_training and self._model is not None:
+        if self._config.diagnose_training and self._model is not None and self._model.inputs:
             self.update.rows = trained.rows
         if self._diagnose is not None and (job := self.diagnosis_job) is not None:
             self.on_finding(self._diagnose(job))

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import msgspec
+import numpy as np
 import pytest
 
 import reactorwatch as rw
@@ -20,6 +21,7 @@ from monitor_node.node import MonitorNode
 from monitor_node.replay.verification import verify
 from monitor_node.watch.baselines import ANSWER_ROWS
 from monitor_node.watched_process import load_process
+from reactorwatch.arrays import Array
 from reactorwatch.contract.codec import Encoded, Publication, decode, encode
 from reactorwatch.contract.messages_pb2 import Baseline, Incident, Promise
 from reactorwatch.description.read import find_process
@@ -27,6 +29,7 @@ from reactorwatch.diagnosis.report import panels
 from reactorwatch.records.record import Record
 from reactorwatch.runtime.jobs import ProcessExecutor, SerialExecutor
 from recorder.tools.player import samples_of
+from tests import cascade
 from tests.cascade import FORMS, USUAL, simulate, write_forms
 
 TRAINING, FAULT, ROWS, START_NS = 250, 320, 450, 1_750_000_000 * 10**9
@@ -138,6 +141,36 @@ def test_a_cause_that_its_file_lost_since_the_start_fails_the_diagnosis_in_a_lin
     finding = find_deviations(pickle.loads(pickle.dumps(job)))
     assert finding.verdict == FAILED
     assert finding.why.endswith("own.py must have the causes that it had when the monitor started, lacks fouling")
+
+
+def test_with_generic_causes_beside_its_own_a_process_has_alarms_traced_to_both(folder: Path, tmp_path: Path) -> None:
+    """None of its own causes is a bias of T1."""
+    text = (folder / "own.py").read_text().replace("model, effects())", "model, effects(), generic=True)")
+    (tmp_path / "both.py").write_text(text)
+    record = simulate(ROWS, 5)
+    record.columns["T1"][FAULT:] += 1.0
+    found = rw.backtest(record, process=tmp_path / "both.py", training_rows=TRAINING, diagnose_training=False)
+    assert "T1.bias" in [item.cause for item in found.alarms[-1].suspect[:3]]
+    assert {"heating", "T1.bias"} <= {item.deviation for item in found.power}
+
+
+@pytest.mark.slow
+def test_what_its_equations_lack_is_found_as_a_law(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Tank 1 loses heat above 38 degC, as if it boiled."""
+    monkeypatch.setattr(cascade, "rates", boil(cascade.rates))
+    found = rw.diagnose(simulate(900, 3), process=folder / "own.py")
+    assert (found.verdict, found.location) == ("unknown", "tank1")
+    assert found.law is not None
+    assert found.law.formula == "b max(T1 - c, 0)"
+    assert found.law.parameters["b"].value == pytest.approx(-0.5, rel=0.02)
+    assert found.law.parameters["c"].value == pytest.approx(38.0, abs=0.1)
+    for errors in found.gain.held_out.values():
+        assert errors.rmse_after < 1.1 * errors.noise_sd < 0.1 * errors.rmse_before
+
+
+def boil(rates: Callable[..., Array]) -> Callable[..., Array]:
+    """Rates of the tanks with a loss of heat in tank 1 above 38 degC."""
+    return lambda x, *given: rates(x, *given) - np.array([0.0, 0.5 * max(float(x[1]) - 38.0, 0.0), 0.0])
 
 
 @pytest.mark.parametrize(

@@ -100,5 +100,5 @@ def test_a_live_monitor_continues_while_its_training_is_diagnosed_and_changes_th
     reference = monitor.pipeline.evaluation.reference
     assert isinstance(reference, ProcessReference)
     assert (
-        reference.model is monitor.pipeline.baselines.equations is read_equations(change.model)
+        reference.model is monitor.pipeline.baselines.equations is read_equations(change.model, monitor.pipeline.model)
     )  # the one that was prepared

@@ -296,3 +296,12 @@ def test_equations_without_an_input_judge_a_plant() -> None:
     assert live(resumed, messages[120:]) == told
     assert not alarms(first)
     assert next(item.message.alarm for item in told if isinstance(item.message, Alarm)) in ("shewhart/h", "ewma/h")
+
+
+def test_a_sensor_that_reads_too_much_is_suspected_in_a_process_without_inputs() -> None:
+    values = 2.0 + 0.01 * np.random.default_rng(4).normal(size=(ROWS, 1))
+    values[FAULT_ROW:] += 0.2
+    plant = Plant((), ("h",), values)
+    found = backtest.run(plant.messages(), plant.config(reference="equations", isolation=True), model=decay())
+    assert {item.cause for item in found.alarms[0].suspect[:2]} == {"h.bias", "h.gain"}
+    assert not [note for note in found.notes if "not diagnosed" in note]

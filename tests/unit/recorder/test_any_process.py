@@ -293,6 +293,8 @@ def test_given_constants_and_constant_deviations_are_stored_too(tmp_path: Path) 
     assert stored.uncertain == rig.uncertain == {"a2": 0.01}
     assert stored.require_model().parameter("a2").value == 0.62
     assert stored.units == {**rig.units}
+    assert not stored.generic
+    assert store(replace(rig, generic=True)).generic
     leak = parse_fault("leak1:constant:0.1", rig.effects)
     leaking = replace(rig, equations=leak.extend(find_process("three_tanks").require_model()))
     assert store(leaking).require_model().parameter("leak1.size").value == 0.1

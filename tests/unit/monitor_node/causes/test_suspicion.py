@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from monitor_node.causes.stage import LOOKS
+from monitor_node.alarms.alarms import SuspectedCause
+from monitor_node.causes.stage import LOOKS, select_likely
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from reactorwatch.contract.messages_pb2 import Alarm, Incident, Reconstruction
@@ -154,3 +155,19 @@ def test_a_sound_run_and_one_that_is_asked_not_to_look_suspect_nothing() -> None
     unasked = watched(time_min, columns, MonitorConfig(isolation=False))
     assert unasked.raised
     assert not any(isinstance(item.message, Alarm) and item.message.suspects for item in unasked.published)
+
+
+@pytest.mark.parametrize(
+    ("given", "published"),
+    [
+        ({"leak": 0.95, "unknown": 0.04, "bias": 0.009}, ["leak", "unknown"]),
+        ({"unknown": 0.999, "leak": 7e-4, "bias": 2e-4, "drift": 1e-4}, ["unknown", "leak", "bias"]),
+        ({"unknown": 1.0, "leak": 1e-30, "bias": 1e-40}, ["unknown", "leak"]),
+        ({"unknown": 1.0}, ["unknown"]),
+    ],
+)
+def test_the_two_nearest_causes_are_published_even_where_unknown_outweighs_them(
+    given: dict[str, float], published: list[str]
+) -> None:
+    suspects = [SuspectedCause(cause, probability) for cause, probability in given.items()]
+    assert [item.cause for item in select_likely(suspects)] == published
