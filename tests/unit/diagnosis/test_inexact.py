@@ -24,7 +24,7 @@ from reactorwatch.process.library.cascaded_tanks import tanks
 from reactorwatch.process.model import ProcessModel
 
 ROWS, PERIOD_MIN = 240, 0.1
-TIME = PERIOD_MIN * np.arange(ROWS)
+TIME = np.asarray(PERIOD_MIN * np.arange(ROWS), dtype=float)
 
 
 @lru_cache(maxsize=1)
