@@ -48,7 +48,7 @@ EXPLAINS, MOST, SOME = 0.95, 0.5, 0.1
 """Shares of the squared error from which on a cause explains a record, explains most of it, or is worth naming."""
 
 SMALL_LEFT = 0.3
-"""What nuisance may leave of the tolerance to be preferred to a law."""
+"""Share of the tolerance: nuisance alone that leaves less is preferred to a law."""
 
 SMALL_EFFECT, LARGE_SHARE = 0.5, 0.8
 """A record within the tolerance without any cause is right, unless a cause changes the outputs by the first of these,
@@ -63,7 +63,7 @@ class Found(NamedTuple):
         is_rivalled: whether other causes are worse by less than `SURE`.
         are_sources: whether the best, and all within `SURE`, are unmodelled sources.
         causes: number of causes of the best.
-        minus_log10_p: of the whiteness of its residual, the largest of the outputs.
+        minus_log10_p: whiteness of its residual, the largest of the outputs.
     """
 
     lead: float
@@ -111,7 +111,7 @@ class Graded(NamedTuple):
 
 
 class Verdict(NamedTuple):
-    """What is said: verdict and grade; and whether the explanations with nuisance say it."""
+    """Verdict and grade, and true if they are those of the explanations with nuisance."""
 
     verdict: str
     grade: str

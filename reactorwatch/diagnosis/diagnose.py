@@ -134,7 +134,7 @@ def diagnose(
     result = _drop_hidden(search_noise_growth(search, result), hidden)
     best = result.best if result.nominal.bic - result.best.bic >= LEAST_GAIN else result.nominal
     adequacy = minus_log10_p(best.fit.w, run.inputs)
-    found = _found(result, best, adequacy)
+    found = _search_evidence(result, best, adequacy)
     verdict = decide_without_nuisance(found, None)
     location = best.hypothesis.filter.effects[0].location if best.label else ""
     remarks = [*_describe_record(record), *_describe_outliers(whole, run)]
@@ -143,7 +143,7 @@ def diagnose(
         white = best.label and verdict != UNKNOWN and found.is_white and not _seems_noisy(result, model)
         unknown = unknowns.localise(best.bic if white else np.inf)
         by_source = verdict == UNKNOWN and found.is_white
-        verdict = decide_without_nuisance(found, _place_found(unknown, result, best, run, found.minus_log10_p))
+        verdict = decide_without_nuisance(found, _place_result(unknown, result, best, run, found.minus_log10_p))
         if verdict == UNKNOWN:
             best = result.nominal
             if not by_source:
@@ -298,8 +298,8 @@ def _starts(run: Run, nominal: FittedHypothesis, model: ProcessModel) -> Array:
     return np.asarray(x[rows])
 
 
-def _found(result: SearchResult, best: FittedHypothesis, adequacy: Array) -> Found:
-    """What a search found, for `decide`."""
+def _search_evidence(result: SearchResult, best: FittedHypothesis, adequacy: Array) -> Found:
+    """Evidence of a search, for `decide`."""
     others = [item for item in result.hypotheses if item.hypothesis.causes != best.hypothesis.causes]
     close = [item for item in others if item.bic - best.bic < SURE]
     return Found(
@@ -311,10 +311,10 @@ def _found(result: SearchResult, best: FittedHypothesis, adequacy: Array) -> Fou
     )
 
 
-def _place_found(
+def _place_result(
     unknown: Localised, result: SearchResult, best: FittedHypothesis, run: Run, log_p: float
 ) -> PlaceFound:
-    """What a search for an unknown found, for `decide`."""
+    """Evidence of a search for an unknown, for `decide`."""
     is_near = False
     if best.label and log_p >= WHITE:
         sensor_sd = result.noise.sensor_sd(result.nominal.hypothesis.filter.model.output_names)

@@ -130,7 +130,7 @@ def list_causes(explanations: Sequence[tuple[Cause, ...]], weights: Sequence[Wei
 
 
 def remaining_of(held_out: Mapping[str, HeldOut], location: str | None) -> dict[str, Remaining]:
-    """What is left of the errors, by output."""
+    """Errors that are left, by output."""
     return {
         name: Remaining(item.rmse_after, item.noise_sd, item.unit, location if _is_left(item) else None)
         for name, item in held_out.items()
@@ -200,10 +200,10 @@ def with_nuisance(
         uncertain: standard deviations of parameters.
     """
     bands = np.array([tolerances[name] for name in model.output_names])
-    graded = [answer.graded(item, explained, bands) for item in explained.explanations]
+    graded = [answer.grades(item, explained, bands) for item in explained.explanations]
     first = exact.nearest[0].share if exact.causes and exact.nearest else 0.0
     left = left_in_tolerances(exact.gain.held_out, tolerances)
-    none = answer.graded(explained.none, explained, bands)
+    none = answer.grades(explained.none, explained, bands)
     verdict = decide(exact.verdict, first, left, none, graded, is_law=exact.law is not None)
     nearest = [cause for item in explained.explanations for cause in answer.causes_of(item, explained)[:1]]
     nearest = list(convert_to_run_minutes(nearest[:MOST_NEAREST], record))
@@ -301,7 +301,7 @@ def _parameters(
 
 
 def left_in_tolerances(held_out: Mapping[str, HeldOut], tolerances: Mapping[str, float]) -> float:
-    """What an explanation leaves beyond the noise, in tolerances, the largest of the outputs."""
+    """Error that an explanation leaves beyond the noise, in tolerances, the largest of the outputs."""
     left = [
         float(excess(np.array(item.rmse_after), np.array(item.noise_sd))) / tolerances[name]
         for name, item in held_out.items()

@@ -124,11 +124,11 @@ class Alternative(Result, frozen=True):
 
 
 class Nuisance(Result, frozen=True):
-    """What differs a little between plant and model beside the causes.
+    """A small difference between plant and model beside the causes.
 
     Attributes:
         name: an effect of the catalogue, or `<signal>.delay` (negative: stamped early) or `<signal>.lag`.
-        value: its estimate.
+        value: estimate of it.
         prior_sd: standard deviation of its prior; None: it is a small correction that was found without one.
     """
 
@@ -138,7 +138,7 @@ class Nuisance(Result, frozen=True):
 
 
 class Remaining(Result, frozen=True):
-    """What is left of an output's simulation error.
+    """Simulation error of an output that is left.
 
     Attributes:
         rmse: root mean square error on held-out rows.

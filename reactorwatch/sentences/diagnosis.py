@@ -69,7 +69,7 @@ def describe_verdict(diagnosis: "Diagnosis", *, are_listed: bool = False) -> str
 
 
 def describe_nuisance(diagnosis: "Diagnosis") -> str:
-    """What differs a little beside the causes, in words."""
+    """Small differences beside the causes, in words."""
     return ", ".join(_describe_correction(item) for item in diagnosis.nuisance)
 
 

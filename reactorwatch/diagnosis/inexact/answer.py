@@ -1,4 +1,4 @@
-"""What is reported of explanations with nuisance: causes, nuisance, errors, curves and the extended model."""
+"""Report of explanations with nuisance: causes, nuisance, errors, curves and the extended model."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -17,8 +17,8 @@ WORTH = 2.0
 """Nuisance is reported if it is more than this many of its standard deviations from 0."""
 
 
-def graded(item: Explanation, explained: Explained, tolerances: Array) -> Graded:
-    """What a verdict depends on.
+def grades(item: Explanation, explained: Explained, tolerances: Array) -> Graded:
+    """Numbers that a verdict depends on.
 
     Args:
         item: an explanation.

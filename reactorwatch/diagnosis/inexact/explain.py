@@ -172,7 +172,7 @@ class _Comparison:
                 return None
             simulated = again
         fits = self._fit_best(self._rank(theta, simulated, noise), theta, noise, LAST)
-        return self._explained(fits, noise) if any(item.hypothesis.kind == NONE for item in fits) else None
+        return self._explanations(fits, noise) if any(item.hypothesis.kind == NONE for item in fits) else None
 
     def _rank(self, theta: Array, simulated: Simulated, noise: Discrepancy) -> list[Hypothesis]:
         """All hypotheses by the model linearised about a simulation."""
@@ -214,7 +214,7 @@ class _Comparison:
             result += [max(fits, key=lambda fit: fit.log_evidence)] if fits else []
         return result
 
-    def _explained(self, fits: Sequence[Fitted], noise: Discrepancy) -> Explained:
+    def _explanations(self, fits: Sequence[Fitted], noise: Discrepancy) -> Explained:
         """Shares and probabilities of the fits of the last round."""
         noise_sd = np.maximum(white_noise_sd(self._run.measured, noise), self._smallest_sd)
         none = next(item for item in fits if item.hypothesis.kind == NONE)
@@ -222,16 +222,16 @@ class _Comparison:
         total = sum(exp(item.log_evidence - top) for item in fits)
         result: list[Explanation] = []
         for item in sorted(fits, key=lambda item: -item.log_evidence):
-            hidden = self._held_out(item)
-            left = self._left(item, hidden, noise_sd)
-            before, after = (_excess(each, noise_sd) for each in (self._left(none, hidden, noise_sd), left))
+            hidden = self._hidden_rows(item)
+            left = self._excess(item, hidden, noise_sd)
+            before, after = (_total(each, noise_sd) for each in (self._excess(none, hidden, noise_sd), left))
             share = min(max(1.0 - after / before, 0.0), 1.0) if before > 0.0 else 0.0
             effect = None if item is none else self._effect(item.hypothesis)
             prior = item.hypothesis.prior
             size_sd = float(np.hypot(item.size_sd, KNOWN_SHARE * max(prior.kappa, prior.lam) * item.hypothesis.size))
             probability = share**2 * exp(item.log_evidence - top) / total
             result.append(Explanation(effect, (), item, size_sd, share, probability, left, self._effect_size(item)))
-        causes = self._joined([item for item in result if item.effect is not None])
+        causes = self._join([item for item in result if item.effect is not None])
         alone = next(item for item in result if item.effect is None)
         return Explained(tuple(causes), alone, self._nuisance, self._courses, noise_sd)
 
@@ -240,7 +240,7 @@ class _Comparison:
             return self._causes[hypothesis.effect]
         return self._simulation.effects[hypothesis.effect]
 
-    def _held_out(self, item: Fitted) -> NDArray[np.bool_]:
+    def _hidden_rows(self, item: Fitted) -> NDArray[np.bool_]:
         """Kept rows that are held out; those about the onset are not, because no others determine it."""
         times = self._run.time_min
         length_min = min(BLOCK_MIN, self._courses.span_min / FEWEST_BLOCKS)
@@ -250,7 +250,7 @@ class _Comparison:
             first -= np.floor((item.hypothesis.onset - times[0]) / length_min) % EVERY == first
         return np.asarray(blocks % EVERY == first)[self._rows]
 
-    def _left(self, item: Fitted, hidden: NDArray[np.bool_], noise_sd: Array) -> Array:
+    def _excess(self, item: Fitted, hidden: NDArray[np.bool_], noise_sd: Array) -> Array:
         """Root mean square error on held-out rows beyond the noise, by output."""
         known = np.isfinite(self._run.measured[self._rows][hidden])
         square = np.sum(item.residual_without(hidden)[hidden] ** 2, axis=0) / np.maximum(known.sum(axis=0), 1)
@@ -267,7 +267,7 @@ class _Comparison:
         difference = self._nuisance.read(item.simulated, item.theta) - self._nuisance.read(without, theta)
         return np.asarray(np.sqrt(np.mean(difference**2, axis=0)))
 
-    def _joined(self, items: Sequence[Explanation]) -> list[Explanation]:
+    def _join(self, items: Sequence[Explanation]) -> list[Explanation]:
         """Explanations by different causes, of which those that do the same are one."""
         result: list[Explanation] = []
         for item in items:
@@ -289,6 +289,6 @@ class _Comparison:
         return bool(np.sum((a - b) ** 2) < (1.0 - EQUAL) * np.sum(a**2))
 
 
-def _excess(left: Array, noise_sd: Array) -> float:
+def _total(left: Array, noise_sd: Array) -> float:
     """Squared error beyond the noise, over that of the noise, summed over the outputs."""
     return float(np.sum((left / noise_sd) ** 2))

@@ -172,7 +172,7 @@ class _Fit:
             for _ in range(TRIES):
                 damped = information + damping * np.diag(np.diag(information))
                 step = np.asarray(np.linalg.solve(damped, gradient), dtype=float)
-                other = self._evaluate(*self._moved(point, step))
+                other = self._evaluate(*self._move(point, step))
                 if other is not None and other.loss < point.loss:
                     point, damping = other, 0.1 * damping
                     break
@@ -181,7 +181,7 @@ class _Fit:
                 break
         return self._result(point)
 
-    def _moved(self, point: _Point, step: Array) -> tuple[Array, Array]:
+    def _move(self, point: _Point, step: Array) -> tuple[Array, Array]:
         """Parameters after a step in the trust region and within their bounds."""
         step = step * min(1.0, FARTHEST / max(float(np.max(np.abs(step / self._all_sds))), 1e-12))
         n = self._sds.size

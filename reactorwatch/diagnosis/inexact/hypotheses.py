@@ -51,7 +51,7 @@ class Hypothesis(NamedTuple):
 
     @property
     def cause(self) -> tuple[str, int]:
-        """What identifies the cause with its profile."""
+        """Profile and index, by which hypotheses of one cause are found."""
         return self.kind, self.effect
 
 

@@ -131,7 +131,7 @@ class InexactSimulation:
         self._output = ca.Function("output", [x, u, eta, t], [shown])
         self._output_slopes = ca.Function("shown", [x, u, eta, t], [_jacobian(shown, by) for by in (x, eta)])
 
-    def _repeated(self, function: ca.Function, times: int, *, accumulated: bool = False) -> ca.Function:
+    def _function_for(self, function: ca.Function, times: int, *, accumulated: bool = False) -> ca.Function:
         """The function for many arguments at once, or for a sequence of steps."""
         key = (function.name(), times, accumulated)
         if key not in self._functions_for_rows:
@@ -171,12 +171,12 @@ class InexactSimulation:
             x[begin] = start
             if end - begin > 1:
                 part = slice(begin, end - 1)
-                steps = self._repeated(self._step, (end - begin - 1) * self._steps, accumulated=True)
+                steps = self._function_for(self._step, (end - begin - 1) * self._steps, accumulated=True)
                 states = np.array(steps(start, *self._arguments(inputs[part], eta[part], part)))
                 x[begin + 1 : end] = states[:, self._steps - 1 :: self._steps].T
         if not np.all(np.isfinite(x)):
             return None
-        shown, where = self._repeated(self._output, rows), (x.T, self.run.inputs.T)
+        shown, where = self._function_for(self._output, rows), (x.T, self.run.inputs.T)
         true = np.array(shown(*where, np.tile(self._neutral[:, None], rows), self.run.time_min)).T
         y = np.array(shown(*where, (self._neutral + deviation.value).T, self.run.time_min)).T
         return Simulated(x, true, y - true, inputs, deviation) if np.all(np.isfinite(y)) else None
@@ -194,18 +194,20 @@ class InexactSimulation:
         arguments = self._arguments(simulated.inputs, eta, slice(None))
         states = [simulated.x[:-1]]
         each, all_rows = (
-            self._repeated(self._step, rows - 1),
+            self._function_for(self._step, rows - 1),
             [item.reshape(*item.shape[:-1], rows - 1, n) for item in arguments],
         )
         for step in range(n - 1):
             states.append(np.array(each(states[-1].T, *(item[..., step] for item in all_rows))).T)
         result: tuple[Array, ...] = ()
         for step, x in enumerate(states):
-            found = self._repeated(self._step_slopes, rows - 1)(x.T, *(item[..., step] for item in all_rows))
+            found = self._function_for(self._step_slopes, rows - 1)(x.T, *(item[..., step] for item in all_rows))
             a, b, g = (_by_row(item, rows - 1) for item in found)
             result = (a @ result[0], a @ result[1] + b, a @ result[2] + g) if result else (a, b, g)
         sizes = (self._neutral + simulated.deviation.value).T
-        shown = self._repeated(self._output_slopes, rows)(simulated.x.T, self.run.inputs.T, sizes, self.run.time_min)
+        shown = self._function_for(self._output_slopes, rows)(
+            simulated.x.T, self.run.inputs.T, sizes, self.run.time_min
+        )
         return Slopes(*result, *(_by_row(item, rows) for item in shown))
 
     def propagate(self, slopes: Slopes, starts: Array, forcing: "Forcing") -> Array:
@@ -241,10 +243,10 @@ class InexactSimulation:
                 total = inside + first * np.minimum(at - times[0], 0.0) + last * np.maximum(at - times[-1], 0.0)
                 result[:, j] = np.diff(total) / self._interval
             if lag > 0.0:
-                result[:, j] = self._lagged(result[:, j], lag)
+                result[:, j] = self._lag_mean(result[:, j], lag)
         return result
 
-    def _lagged(self, held: Array, lag: float) -> Array:
+    def _lag_mean(self, held: Array, lag: float) -> Array:
         """Mean of a first-order lag's output over each interval, of an input that is held over each."""
         h = self.run.period_min
         kept = float(np.exp(-h / lag))
@@ -272,7 +274,7 @@ class InexactSimulation:
 
 
 class Forcing:
-    """What acts on the states between rows and on the sensors, in columns.
+    """Deviations that act on the states between rows and on the sensors, in columns.
 
     Args:
         states: shape (rows - 1, n_x, n).

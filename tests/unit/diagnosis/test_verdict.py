@@ -18,7 +18,7 @@ from reactorwatch.diagnosis.decide import (
     decide_without_nuisance,
     grade_of,
 )
-from reactorwatch.diagnosis.diagnose import _alternatives, _drop_hidden, _found
+from reactorwatch.diagnosis.diagnose import _alternatives, _drop_hidden, _search_evidence
 from reactorwatch.diagnosis.result import AMBIGUOUS, LISTED, NAMED, NOMINAL, UNKNOWN
 from reactorwatch.diagnosis.search.search import FittedHypothesis, SearchResult
 
@@ -65,13 +65,13 @@ def test_the_verdict_follows_from_the_causes_near_the_best(
     hypotheses: list[tuple[tuple[str, ...], float]], verdict: str
 ) -> None:
     found = result(*hypotheses)
-    assert decide_without_nuisance(_found(found, found.best, np.zeros(1)), None) == verdict
+    assert decide_without_nuisance(_search_evidence(found, found.best, np.zeros(1)), None) == verdict
 
 
 @pytest.mark.parametrize("nearest", [0.01, 100.0])
 def test_the_nominal_hypothesis_wins_whatever_is_near(nearest: float) -> None:
     found = result(((LEAK,), nearest), nominal=0.0)  # of which the search takes the nominal one
-    assert decide_without_nuisance(_found(found, found.nominal, np.zeros(1)), None) == NOMINAL
+    assert decide_without_nuisance(_search_evidence(found, found.nominal, np.zeros(1)), None) == NOMINAL
     assert _alternatives(found, found.nominal) == []
 
 
@@ -119,7 +119,7 @@ WHITE_RESIDUAL, COLOURED, MUCH = 0.3, 9.0, 40.0  # minus the decimal logarithms 
         (Found(0.0, False, False, 0, WHITE_RESIDUAL), PlaceFound(True, 100.0, True), NOMINAL),
     ],
 )
-def test_an_unknown_is_said_where_a_place_or_the_residual_calls_for_it(
+def test_the_verdict_is_unknown_where_a_place_or_the_residual_calls_for_it(
     found: Found, place: PlaceFound, verdict: str
 ) -> None:
     assert decide_without_nuisance(found, place) == verdict
@@ -131,7 +131,7 @@ CAUSE = Graded(500.0, 0.99, 0.1, 3.0, "step")
 
 
 @pytest.mark.parametrize(
-    ("none", "graded", "said"),
+    ("none", "graded", "verdict"),
     [
         (NONE, [CAUSE], Verdict(NAMED, "explained", with_nuisance=True)),
         (NONE, [CAUSE._replace(share=0.7, left=2.0)], Verdict(NAMED, "mostly", with_nuisance=True)),
@@ -148,9 +148,9 @@ CAUSE = Graded(500.0, 0.99, 0.1, 3.0, "step")
     ],
 )
 def test_the_grade_follows_from_what_the_best_cause_removes_and_leaves(
-    none: Graded, graded: list[Graded], said: Verdict
+    none: Graded, graded: list[Graded], verdict: Verdict
 ) -> None:
-    assert decide(UNKNOWN, 0.0, 4.0, none, graded) == said
+    assert decide(UNKNOWN, 0.0, 4.0, none, graded) == verdict
 
 
 def test_a_law_stays_unless_a_cause_explains_the_record_or_nuisance_alone_leaves_next_to_nothing() -> None:
