@@ -4,9 +4,9 @@
 |---|---|---|
 | no explanation is better than the simulation as it is by `LEAST_GAIN` | nominal | right |
 | only unmodelled sources explain it, or a place explains it better than the catalogue | unknown | see below |
-| with nuisance, no cause is better than none by `LEAST_GAIN` | nominal | right |
-| with nuisance, what is left without a cause is within the tolerance, and the cause is there from the beginning, \
-changes the outputs by less than half of it or removes less than 0.8 | nominal | right |
+| with nuisance, what is left without a cause is within the tolerance, and the best cause is better than none by less \
+than `LEAST_GAIN`, is there from the beginning, changes the outputs by less than half of the tolerance or removes less \
+than 0.8 | nominal | right |
 | a law explains it, nuisance alone leaves more than 0.3 of the tolerance, and no cause with an onset removes 95 % | \
 unknown | see below |
 | the best cause with nuisance removes at least half | named, or ambiguous | explained or mostly |
@@ -174,12 +174,12 @@ def decide(
         return Verdict(verdict, grade_of(verdict, share, left))
     best = graded[0]
     is_small = best.profile == CONSTANT.name or best.effect < SMALL_EFFECT or best.share < LARGE_SHARE
-    is_right = best.lead < LEAST_GAIN or (none.left <= 1.0 and is_small)
-    if is_right and (none.left <= SMALL_LEFT or not is_law):
+    is_small = is_small or best.lead < LEAST_GAIN
+    if is_small and none.left <= (SMALL_LEFT if is_law else 1.0):
         return Verdict(NOMINAL, RIGHT, with_nuisance=True)
     if is_law and (best.share < EXPLAINS or best.profile in (CONSTANT.name, FREE_NAME)):
         return Verdict(verdict, grade_of(verdict, max(item.share for item in graded), left))
-    if best.share >= MOST:
+    if best.share >= MOST and best.lead >= LEAST_GAIN:
         rivals = [item for item in graded[1:] if best.lead - item.lead < LISTED and item.share >= MOST]
         named = AMBIGUOUS if rivals else NAMED
         return Verdict(named, grade_of(named, best.share, best.left), with_nuisance=True)

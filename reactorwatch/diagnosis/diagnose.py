@@ -42,6 +42,7 @@ from reactorwatch.diagnosis.graded import (
 from reactorwatch.diagnosis.holdout import Errors, evaluate_holdout, is_near_noise
 from reactorwatch.diagnosis.inexact.answer import onset_of
 from reactorwatch.diagnosis.inexact.explain import explain
+from reactorwatch.diagnosis.inexact.nuisance import LAG_SHARE, SHORTEST_MIN
 from reactorwatch.diagnosis.lasting import LastingResult, prefer_lasting
 from reactorwatch.diagnosis.law.describe import describe_law, law_hypothesis
 from reactorwatch.diagnosis.law.unknown import NOISY_SHARE, Localised, UnknownSearch
@@ -72,6 +73,7 @@ from reactorwatch.diagnosis.result import (
 from reactorwatch.diagnosis.run import Run
 from reactorwatch.diagnosis.search.noise import search_noise_growth, search_single_cause
 from reactorwatch.diagnosis.search.pairs import search_pairs
+from reactorwatch.diagnosis.search.screen import Part
 from reactorwatch.diagnosis.search.search import FittedHypothesis, Search, SearchResult, smallest_noise
 from reactorwatch.diagnosis.whiteness import DOUBTFUL, WHITE, looks_like_integration, minus_log10_p
 from reactorwatch.process import effects_of
@@ -81,8 +83,6 @@ from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.profiles import CONSTANT, FREE_NAME
 from reactorwatch.process.signal_effects import InputDelay, InputLag, OutputDelay, OutputLag
 from reactorwatch.records.record import MAX_SPANS, Record
-
-TIMES = (InputDelay, InputLag, OutputDelay, OutputLag)
 
 KEPT_BYTES = 31_000_000
 
@@ -266,7 +266,7 @@ def diagnose(
         remarks=tuple(remarks),
         curves=curves,
     )
-    if not _calls_for_nuisance(exact, result, best, model):
+    if not _calls_for_nuisance(exact, result, best, model, run):
         return exact
     explained = explain(model, effects, run, _starts(run, result.nominal, model), uncertain or {}, smallest_sd)
     if explained is None:
@@ -275,19 +275,27 @@ def diagnose(
 
 
 def _calls_for_nuisance(
-    diagnosis: Diagnosis, result: SearchResult, best: FittedHypothesis, model: ProcessModel
+    diagnosis: Diagnosis, result: SearchResult, best: FittedHypothesis, model: ProcessModel, run: Run
 ) -> bool:
     """True if the hypotheses are to be compared with nuisance: nothing simple explains the record to the noise."""
-    if diagnosis.verdict == UNKNOWN:
-        return True
     is_white = all(item.minus_log10_p < DOUBTFUL for item in diagnosis.adequacy.values())
+    if diagnosis.verdict == UNKNOWN:
+        return diagnosis.practical or diagnosis.law is None or not is_white
     is_pair = len(best.label) > 1
     is_simple = not is_pair and FREE_NAME not in [profile.name for profile in best.hypothesis.profiles]
-    if is_pair and all(isinstance(effect, TIMES) for effect in best.hypothesis.filter.effects):
-        return True  # clocks and sensors are a little late everywhere
+    if is_pair and all(_is_a_little_late(part, run) for part in best.parts):
+        return True  # as clocks and sensors are everywhere
     if is_white:
         return not is_simple and _seems_noisy(result, model)
     return not is_simple or diagnosis.verdict == AMBIGUOUS
+
+
+def _is_a_little_late(part: Part, run: Run) -> bool:
+    """True if a cause is a constant lag or delay within twice the standard deviation of its prior as nuisance."""
+    share = LAG_SHARE if isinstance(part.effect, (InputLag, OutputLag)) else 1.0
+    most_min = 2.0 * share * max(SHORTEST_MIN, run.period_min)
+    is_time = isinstance(part.effect, (InputDelay, InputLag, OutputDelay, OutputLag))
+    return is_time and part.profile.name == CONSTANT.name and float(part.parameters[0]) <= most_min
 
 
 def _starts(run: Run, nominal: FittedHypothesis, model: ProcessModel) -> Array:

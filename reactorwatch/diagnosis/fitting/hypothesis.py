@@ -231,8 +231,10 @@ class Hypothesis:
     def _covariance(self, g: Array) -> Array:
         """Covariance of the parameters from their Jacobian."""
         self.filter.spend(StepCost.COVARIANCE)
-        information = g.T @ g + self._prior_information()
-        return inverse(information)
+        known = self._prior_information()
+        if np.max(np.abs(g), initial=0.0) < _RUNAWAY:  # else the rows tell nothing
+            known = known + g.T @ g
+        return inverse(known)
 
     def _prior_information(self) -> Array:
         """Prior information: the width of each parameter's range; of a constant, the standard deviation of its prior.
