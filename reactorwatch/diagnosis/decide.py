@@ -4,11 +4,10 @@
 |---|---|---|
 | no explanation is better than the simulation as it is by `LEAST_GAIN` | nominal | right |
 | only unmodelled sources explain it, or a place explains it better than the catalogue | unknown | see below |
+| a law explains it, and no cause with an onset removes 95 % with nuisance | unknown | see below |
 | with nuisance, what is left without a cause is within the tolerance, and the best cause is better than none by less \
 than `LEAST_GAIN`, is there from the beginning, changes the outputs by less than half of the tolerance or removes less \
 than 0.8 | nominal | right |
-| a law explains it, nuisance alone leaves more than 0.3 of the tolerance, and no cause with an onset removes 95 % | \
-unknown | see below |
 | the best cause with nuisance removes at least half | named, or ambiguous | explained or mostly |
 | otherwise, without nuisance | named, or ambiguous with a rival within `SURE` | explained or mostly |
 
@@ -46,9 +45,6 @@ imitate a third."""
 
 EXPLAINS, MOST, SOME = 0.95, 0.5, 0.1
 """Shares of the squared error from which on a cause explains a record, explains most of it, or is worth naming."""
-
-SMALL_LEFT = 0.3
-"""Share of the tolerance: nuisance alone that leaves less is preferred to a law."""
 
 SMALL_EFFECT, LARGE_SHARE = 0.5, 0.8
 """A record within the tolerance without any cause is right, unless a cause changes the outputs by the first of these,
@@ -175,10 +171,10 @@ def decide(
     best = graded[0]
     is_small = best.profile == CONSTANT.name or best.effect < SMALL_EFFECT or best.share < LARGE_SHARE
     is_small = is_small or best.lead < LEAST_GAIN
-    if is_small and none.left <= (SMALL_LEFT if is_law else 1.0):
-        return Verdict(NOMINAL, RIGHT, with_nuisance=True)
     if is_law and (best.share < EXPLAINS or best.profile in (CONSTANT.name, FREE_NAME)):
         return Verdict(verdict, grade_of(verdict, max(item.share for item in graded), left))
+    if is_small and none.left <= 1.0:
+        return Verdict(NOMINAL, RIGHT, with_nuisance=True)
     if best.share >= MOST and best.lead >= LEAST_GAIN:
         rivals = [item for item in graded[1:] if best.lead - item.lead < LISTED and item.share >= MOST]
         named = AMBIGUOUS if rivals else NAMED

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from reactorwatch.diagnosis.decide import (
-    SMALL_LEFT,
     SURE,
     Found,
     Graded,
@@ -154,15 +153,15 @@ def test_the_grade_follows_from_what_the_best_cause_removes_and_leaves(
     assert decide(UNKNOWN, 0.0, 4.0, none, graded) == verdict
 
 
-def test_a_law_stays_unless_a_cause_explains_the_record_or_nuisance_alone_leaves_next_to_nothing() -> None:
+def test_a_law_stays_unless_a_cause_with_an_onset_explains_the_record() -> None:
     constant = [CAUSE._replace(profile="constant")]
     curve, part = CAUSE._replace(profile="free"), CAUSE._replace(share=0.9)
     assert decide(UNKNOWN, 0.0, 4.0, WITHIN, [curve], is_law=True) == Verdict(UNKNOWN, "nearest")
     assert decide(UNKNOWN, 0.0, 4.0, WITHIN, [part], is_law=True) == Verdict(UNKNOWN, "nearest")
     assert decide(UNKNOWN, 0.0, 4.0, WITHIN, [CAUSE], is_law=True).verdict == NAMED
     assert decide(UNKNOWN, 0.0, 4.0, WITHIN, constant, is_law=True) == Verdict(UNKNOWN, "nearest")
-    nothing = WITHIN._replace(left=0.9 * SMALL_LEFT)
-    assert decide(UNKNOWN, 0.0, 4.0, nothing, constant, is_law=True).verdict == NOMINAL
+    nothing = WITHIN._replace(left=0.1)
+    assert decide(UNKNOWN, 0.0, 4.0, nothing, constant, is_law=True) == Verdict(UNKNOWN, "nearest")
 
 
 @pytest.mark.parametrize("verdict", [NOMINAL, NAMED, AMBIGUOUS, UNKNOWN])
