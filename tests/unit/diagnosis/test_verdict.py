@@ -133,8 +133,9 @@ CAUSE = Graded(500.0, 0.99, 0.1, 3.0, "step")
     ("none", "graded", "verdict"),
     [
         (NONE, [CAUSE], Verdict(NAMED, "explained", with_nuisance=True)),
-        (NONE, [CAUSE._replace(share=0.7, left=2.0)], Verdict(NAMED, "mostly", with_nuisance=True)),
-        (NONE, [CAUSE._replace(share=0.7, left=0.9)], Verdict(NAMED, "explained", with_nuisance=True)),
+        (NONE, [CAUSE._replace(share=0.9, left=2.0)], Verdict(NAMED, "mostly", with_nuisance=True)),
+        (NONE, [CAUSE._replace(share=0.9, left=0.9)], Verdict(NAMED, "explained", with_nuisance=True)),
+        (NONE, [CAUSE._replace(share=0.7, left=2.0)], Verdict(UNKNOWN, "nearest")),
         (NONE, [CAUSE, CAUSE._replace(lead=491.0)], Verdict(AMBIGUOUS, "explained", with_nuisance=True)),
         (NONE, [CAUSE, CAUSE._replace(lead=489.0)], Verdict(NAMED, "explained", with_nuisance=True)),
         (NONE, [CAUSE._replace(share=0.4, left=3.0)], Verdict(UNKNOWN, "nearest")),
