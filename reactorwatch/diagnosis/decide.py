@@ -122,8 +122,6 @@ def decide_without_nuisance(found: Found, place: PlaceFound | None) -> str:
         found: result of the search.
         place: result of the search for an unknown; None: there was none.
     """
-    if found.lead < LEAST_GAIN and place is None:
-        return NOMINAL
     if found.are_sources and found.lead >= LEAST_GAIN:
         return UNKNOWN
     if place is not None:

@@ -42,7 +42,7 @@ from reactorwatch.diagnosis.graded import (
 from reactorwatch.diagnosis.holdout import Errors, evaluate_holdout, is_near_noise
 from reactorwatch.diagnosis.inexact.answer import onset_of
 from reactorwatch.diagnosis.inexact.explain import explain
-from reactorwatch.diagnosis.inexact.nuisance import LAG_SHARE, SHORTEST_MIN
+from reactorwatch.diagnosis.inexact.nuisance import time_sd_min
 from reactorwatch.diagnosis.lasting import LastingResult, prefer_lasting
 from reactorwatch.diagnosis.law.describe import describe_law, law_hypothesis
 from reactorwatch.diagnosis.law.unknown import NOISY_SHARE, Localised, UnknownSearch
@@ -292,9 +292,9 @@ def _calls_for_nuisance(
 
 def _is_a_little_late(part: Part, run: Run) -> bool:
     """True if a cause is a constant lag or delay within twice the standard deviation of its prior as nuisance."""
-    share = LAG_SHARE if isinstance(part.effect, (InputLag, OutputLag)) else 1.0
-    most_min = 2.0 * share * max(SHORTEST_MIN, run.period_min)
-    is_time = isinstance(part.effect, (InputDelay, InputLag, OutputDelay, OutputLag))
+    is_lag = isinstance(part.effect, (InputLag, OutputLag))
+    most_min = 2.0 * time_sd_min(run, is_lag=is_lag)
+    is_time = is_lag or isinstance(part.effect, (InputDelay, OutputDelay))
     return is_time and part.profile.name == CONSTANT.name and float(part.parameters[0]) <= most_min
 
 

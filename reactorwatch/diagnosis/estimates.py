@@ -28,7 +28,7 @@ from reactorwatch.codegen.compiled_function import LANES
 from reactorwatch.diagnosis.fitting.fault_filter import huber_row_losses
 from reactorwatch.diagnosis.fitting.hypothesis import Fit
 from reactorwatch.diagnosis.fitting.profiles import Step
-from reactorwatch.diagnosis.result import AdjustedParameter, Cause, Estimate
+from reactorwatch.diagnosis.result import AdjustedParameter, Cause, Estimate, make_cause
 from reactorwatch.diagnosis.run import Run
 from reactorwatch.diagnosis.search.search import FittedHypothesis, Search
 from reactorwatch.process.effect import Effect
@@ -323,15 +323,7 @@ def hypothesis_causes(best: FittedHypothesis, covariances: Sequence[Array]) -> l
         for index, constant in enumerate(profile.constants, start=profile.n_shape):
             sd = sqrt(max(float(part[index, index]), 0.0))
             parameters[constant.name] = Estimate(float(fitted[index]), sd, constant.unit)
-        causes.append(
-            Cause(
-                cause=effect.name,
-                profile=profile.name,
-                label=effect.labels.get(profile.name, effect.label),
-                location=effect.location,
-                parameters=parameters,
-            )
-        )
+        causes.append(make_cause(effect, profile.name, parameters))
     return causes
 
 

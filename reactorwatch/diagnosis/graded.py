@@ -14,7 +14,7 @@ from reactorwatch.diagnosis.estimates import (
     extended_model,
     hypothesis_causes,
 )
-from reactorwatch.diagnosis.holdout import Errors, rms, simulate_outputs
+from reactorwatch.diagnosis.holdout import Errors, excess, rms, share_of, simulate_outputs
 from reactorwatch.diagnosis.inexact import answer
 from reactorwatch.diagnosis.inexact.explain import Explained, Explanation
 from reactorwatch.diagnosis.result import (
@@ -64,19 +64,6 @@ class Weight(NamedTuple):
             )
             for item in causes
         )
-
-
-def excess(error: Array, noise_sd: Array) -> Array:
-    """Root mean square error beyond the noise, shape (n_y,)."""
-    return np.sqrt(np.maximum(error**2 - noise_sd**2, 0.0))
-
-
-def share_of(before: Array, after: Array, noise_sd: Array) -> float:
-    """Share of the squared errors beyond the noise that an explanation removes; NaN errors diverged."""
-    was, left = (np.sum((excess(item, noise_sd) / noise_sd) ** 2) for item in (before, after))
-    if not np.isfinite(left):
-        return 0.0
-    return 1.0 if not np.isfinite(was) else min(max(1.0 - float(left / was), 0.0), 1.0) if was > 0.0 else 0.0
 
 
 def weights_of(
@@ -266,7 +253,7 @@ def _answer_with_nuisance(
         experiment=None,
         extended_model=extended_model(adjusted, effects, causes, record.zero_ns),
         parameters=_parameters(best, explained, model, uncertain),
-        remarks=exact.remarks[:0],
+        remarks=(),
         curves=curves,
     )
 
@@ -291,12 +278,10 @@ def _parameters(
         if not isinstance(effect, (ParameterEffect, ParameterShift)) or effect.parameter not in uncertain:
             continue
         known = model.parameter(effect.parameter)
-        scale = known.value if isinstance(effect, ParameterEffect) else 1.0
         eta, sd = float(item.fitted.theta[index]), float(item.fitted.theta_sd[index])
-        stated = uncertain[effect.parameter]
-        result[effect.parameter] = AdjustedParameter(
-            known.value, stated, known.value + scale * eta, abs(scale) * sd, known.unit
-        )
+        scale = abs(known.value) if isinstance(effect, ParameterEffect) else 1.0
+        value, stated = effect.changed(known.value, eta), uncertain[effect.parameter]
+        result[effect.parameter] = AdjustedParameter(known.value, stated, value, scale * sd, known.unit)
     return result
 
 

@@ -52,6 +52,11 @@ class Errors(NamedTuple):
     values: NDArray[np.bool_]
 
 
+def blocks_of(run: Run, time_min: Array) -> Array:
+    """Numbers of the blocks in which times are, from 0, shape as the times."""
+    return np.asarray(np.floor((time_min - run.time_min[0]) / min(BLOCK_MIN, run.span_min / FEWEST_BLOCKS)))
+
+
 def holdout_rows(run: Run, onsets_min: Sequence[float] = ()) -> Array:
     """Mask of the held-out rows, shape (rows,).
 
@@ -59,12 +64,11 @@ def holdout_rows(run: Run, onsets_min: Sequence[float] = ()) -> Array:
         run: the record.
         onsets_min: onsets; their blocks are not held out, because no other block determines them.
     """
-    block_min = min(BLOCK_MIN, run.span_min / FEWEST_BLOCKS)
-    block = np.floor((run.time_min - run.time_min[0]) / block_min)
+    block = blocks_of(run, run.time_min)
     result = block % EVERY == EVERY - 1
     for row in (0, *run.starts):
         result[row : row + OBSERVED_ROWS] = False
-    without_onsets = result & ~np.isin(block, [np.floor((onset - run.time_min[0]) / block_min) for onset in onsets_min])
+    without_onsets = result & ~np.isin(block, blocks_of(run, np.array(onsets_min)))
     result = without_onsets if np.count_nonzero(without_onsets) >= FEWEST_ROWS else result
     undisturbed = result.copy()
     for row in run.uncertain_rows:
@@ -89,6 +93,27 @@ def evaluate_holdout(run: Run, nominal: FittedHypothesis, best: FittedHypothesis
     if best is nominal:
         return before, before
     return before, _errors(run, hidden, best.hypothesis.filter, best.hypothesis.signals(fit), offsets)
+
+
+def excess(error: Array, noise_sd: Array) -> Array:
+    """Root mean square error beyond the noise, shape (n_y,)."""
+    return np.asarray(np.sqrt(np.maximum(error**2 - noise_sd**2, 0.0)))
+
+
+def share_of(before: Array, after: Array, noise_sd: Array) -> float:
+    """Share of the squared errors beyond the noise that an explanation removes; NaN: the simulation diverged.
+
+    Args:
+        before: root mean square error of each output without the explanation, shape (n_y,).
+        after: the same with it.
+        noise_sd: standard deviation of each sensor's noise, shape (n_y,).
+    """
+    was, left = (float(np.sum((excess(item, noise_sd) / noise_sd) ** 2)) for item in (before, after))
+    if not np.isfinite(left):
+        return 0.0
+    if not np.isfinite(was):
+        return 1.0
+    return min(max(1.0 - left / was, 0.0), 1.0) if was > 0.0 else 0.0
 
 
 def is_near_noise(errors: Errors, noise_sd: Array) -> bool:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from reactorwatch.arrays import Array
 from reactorwatch.diagnosis.difference import Difference
+from reactorwatch.process.effect import Effect
 from reactorwatch.process.law import ExtendedLaw
 from reactorwatch.results.base import Result
 
@@ -67,6 +68,12 @@ class Cause(Result, frozen=True, kw_only=True):
     beside: tuple[str, ...] = ()
 
     python_only: ClassVar = ("run_shift_min",)
+
+
+def make_cause(effect: Effect, profile: str, parameters: dict[str, Estimate]) -> Cause:
+    """Cause by an effect with a profile, under the name and the label that the effect has then."""
+    label = effect.labels.get(profile, effect.label)
+    return Cause(cause=effect.name, profile=profile, label=label, location=effect.location, parameters=parameters)
 
 
 class AdjustedParameter(Result, frozen=True):

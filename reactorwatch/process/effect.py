@@ -208,11 +208,14 @@ class ParameterEffect(Effect):
 
     def apply(self, model: ProcessModel, size: ca.SX) -> ProcessModel:
         """See `Effect`."""
-        size = -size if self.is_loss else size
         for name in (self.parameter, *self.proportional):
             symbol = model.parameter(name).symbol
-            model = model.substitute(symbol, symbol * (1 + size))
+            model = model.substitute(symbol, self.changed(symbol, size))
         return model
+
+    def changed(self, value: Any, size: Any) -> Any:
+        """A parameter's value with a deviation, as a number or an expression."""
+        return value * (1 + (-size if self.is_loss else size))
 
 
 class ParameterShift(Effect):
@@ -223,7 +226,11 @@ class ParameterShift(Effect):
     def apply(self, model: ProcessModel, size: ca.SX) -> ProcessModel:
         """See `Effect`."""
         symbol = model.parameter(self.parameter).symbol
-        return model.substitute(symbol, symbol + size)
+        return model.substitute(symbol, self.changed(symbol, size))
+
+    def changed(self, value: Any, size: Any) -> Any:
+        """See `ParameterEffect`."""
+        return value + size
 
 
 class SensorEffect(Effect):

@@ -4,12 +4,13 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from msgspec import structs
 
 from reactorwatch.arrays import Array
 from reactorwatch.diagnosis.decide import Graded
 from reactorwatch.diagnosis.inexact.explain import Explained, Explanation
 from reactorwatch.diagnosis.inexact.hypotheses import CONSTANT, CURVE, RAMP, STEP
-from reactorwatch.diagnosis.result import Cause, Curves, Estimate, Nuisance
+from reactorwatch.diagnosis.result import Cause, Curves, Estimate, Nuisance, make_cause
 from reactorwatch.process.effect import ParameterEffect, ParameterShift
 from reactorwatch.process.model import ProcessModel
 
@@ -48,17 +49,8 @@ def causes_of(item: Explanation, explained: Explained) -> list[Cause]:
             shares = fitted.fitted.curve / hypothesis.size if hypothesis.size else np.zeros(knots.size)
             parameters |= {f"time_{i}": Estimate(float(t), 0.0, "min") for i, t in enumerate(knots, start=1)}
             parameters |= {f"value_{i}": Estimate(float(v), 0.0, "1") for i, v in enumerate(shares, start=1)}
-        result.append(
-            Cause(
-                cause=effect.name,
-                profile=hypothesis.kind,
-                label=effect.labels.get(hypothesis.kind, effect.label),
-                location=effect.location,
-                parameters=parameters,
-                share=item.share,
-                probability=item.probability,
-            )
-        )
+        cause = make_cause(effect, hypothesis.kind, parameters)
+        result.append(structs.replace(cause, share=item.share, probability=item.probability))
     return result
 
 
@@ -67,8 +59,7 @@ def _own_factor(item: Explanation, explained: Explained) -> float:
     hypothesis, nuisance = item.fitted.hypothesis, explained.nuisance
     if hypothesis.kind == CONSTANT or not isinstance(item.effect, ParameterEffect):
         return 1.0
-    eta = float(item.fitted.theta[nuisance.effects.start + hypothesis.effect])
-    return 1.0 + (-eta if item.effect.is_loss else eta)
+    return float(item.effect.changed(1.0, float(item.fitted.theta[nuisance.effects.start + hypothesis.effect])))
 
 
 def nuisance_of(item: Explanation, explained: Explained) -> tuple[Nuisance, ...]:
@@ -99,11 +90,7 @@ def adjusted_model(item: Explanation, explained: Explained, model: ProcessModel)
         proportional = effect.proportional if isinstance(effect, ParameterEffect) else ()
         for name in (effect.parameter, *proportional):
             known = model.parameter(name)
-            value = values.get(name, known.value)
-            if isinstance(effect, ParameterEffect):
-                value *= 1.0 + (-eta if effect.is_loss else eta)
-            else:
-                value += eta
+            value = float(effect.changed(values.get(name, known.value), eta))
             values[name] = min(max(value, known.lower), known.upper)
     return model.with_values(values)
 

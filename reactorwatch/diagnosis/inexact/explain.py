@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reactorwatch.arrays import Array
-from reactorwatch.diagnosis.holdout import BLOCK_MIN, EVERY, FEWEST_BLOCKS
+from reactorwatch.diagnosis.holdout import EVERY, blocks_of, excess, rms, share_of
 from reactorwatch.diagnosis.inexact.fit import Fitted, Fitter
 from reactorwatch.diagnosis.inexact.hypotheses import CONSTANT, CURVE, NONE, RAMP, STEP, WIDTH, Courses, Hypothesis
 from reactorwatch.diagnosis.inexact.noise import Discrepancy, estimate_discrepancy, white, white_noise_sd
@@ -36,8 +36,9 @@ ROUNDS = 2
 FIRST, LAST, A_CAUSE = 2, 7, 2
 """Hypotheses with a cause that are fitted in each round, in the last one, and of one cause."""
 
-EQUAL = 1.0 - 1e-6
-"""Cosine beyond which the derivatives by two effects are the same: one explanation with two names."""
+SAME = 1e-6
+"""Squared difference of the residuals of two causes, over the residual's square, below which they do the same: one
+explanation with two names."""
 
 KNOWN_SHARE = 0.03
 """Standard deviation of a size, as a share of it, where constants had to be moved by their typical sizes."""
@@ -223,9 +224,8 @@ class _Comparison:
         result: list[Explanation] = []
         for item in sorted(fits, key=lambda item: -item.log_evidence):
             hidden = self._hidden_rows(item)
-            left = self._excess(item, hidden, noise_sd)
-            before, after = (_total(each, noise_sd) for each in (self._excess(none, hidden, noise_sd), left))
-            share = min(max(1.0 - after / before, 0.0), 1.0) if before > 0.0 else 0.0
+            before, after = (self._error(each, hidden) for each in (none, item))
+            share, left = share_of(before, after, noise_sd), excess(after, noise_sd)
             effect = None if item is none else self._effect(item.hypothesis)
             prior = item.hypothesis.prior
             size_sd = float(np.hypot(item.size_sd, KNOWN_SHARE * max(prior.kappa, prior.lam) * item.hypothesis.size))
@@ -242,19 +242,15 @@ class _Comparison:
 
     def _hidden_rows(self, item: Fitted) -> NDArray[np.bool_]:
         """Kept rows that are held out; those about the onset are not, because no others determine it."""
-        times = self._run.time_min
-        length_min = min(BLOCK_MIN, self._courses.span_min / FEWEST_BLOCKS)
-        blocks = np.floor((times - times[0]) / length_min)
         first = EVERY - 1
         if item.hypothesis.kind in (STEP, RAMP):
-            first -= np.floor((item.hypothesis.onset - times[0]) / length_min) % EVERY == first
-        return np.asarray(blocks % EVERY == first)[self._rows]
+            first -= int(blocks_of(self._run, np.array(item.hypothesis.onset)) % EVERY == first)
+        return np.asarray(blocks_of(self._run, self._run.time_min[self._rows]) % EVERY == first)
 
-    def _excess(self, item: Fitted, hidden: NDArray[np.bool_], noise_sd: Array) -> Array:
-        """Root mean square error on held-out rows beyond the noise, by output."""
+    def _error(self, item: Fitted, hidden: NDArray[np.bool_]) -> Array:
+        """Root mean square error on held-out rows, by output."""
         known = np.isfinite(self._run.measured[self._rows][hidden])
-        square = np.sum(item.residual_without(hidden)[hidden] ** 2, axis=0) / np.maximum(known.sum(axis=0), 1)
-        return np.asarray(np.sqrt(np.maximum(square - noise_sd**2, 0.0)))
+        return np.nan_to_num(rms(np.where(known, item.residual_without(hidden)[hidden], np.nan)))
 
     def _effect_size(self, item: Fitted) -> Array:
         """Root mean square difference between the simulations with and without the cause, by output."""
@@ -286,9 +282,4 @@ class _Comparison:
         if one.fitted.hypothesis.kind != other.fitted.hypothesis.kind or one.fitted.hypothesis.kind == CURVE:
             return False
         a, b = (item.fitted.residual.ravel() for item in (one, other))
-        return bool(np.sum((a - b) ** 2) < (1.0 - EQUAL) * np.sum(a**2))
-
-
-def _total(left: Array, noise_sd: Array) -> float:
-    """Squared error beyond the noise, over that of the noise, summed over the outputs."""
-    return float(np.sum((left / noise_sd) ** 2))
+        return bool(np.sum((a - b) ** 2) < SAME * np.sum(a**2))

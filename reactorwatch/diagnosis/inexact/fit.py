@@ -47,10 +47,9 @@ class Fitted:
     """A hypothesis at its fit.
 
     Attributes:
-        hypothesis: the hypothesis, with its fitted onset and size.
+        hypothesis: the hypothesis, with its fitted onset and size, and the evidence of the fit.
         theta: nuisance, shape (size,).
         curve: sizes at the knots of a curve, shape (KNOTS,); zeros for another profile.
-        log_evidence: logarithm of the evidence.
         residual: residual at the kept rows, 0 where not measured, shape (kept rows, n_y).
         simulated: the simulation.
         size_sd: standard deviation of the size.
@@ -65,7 +64,6 @@ class Fitted:
     hypothesis: Hypothesis
     theta: Array
     curve: Array
-    log_evidence: float
     residual: Array
     simulated: Simulated
     size_sd: float
@@ -75,6 +73,11 @@ class Fitted:
     white: Array
     white_residual: Array
     information: Array
+
+    @property
+    def log_evidence(self) -> float:
+        """Logarithm of the evidence."""
+        return self.hypothesis.log_evidence
 
     def residual_without(self, hidden: NDArray[np.bool_]) -> Array:
         """Residual at the kept rows of a fit to the others than these, by the derivatives of this fit."""
@@ -153,6 +156,7 @@ class _Fit:
             self._lower = np.array([effect.lower - effect.neutral, times[0]])
             self._upper = np.array([effect.upper - effect.neutral, times[-1] - courses.period_min])
         self._all_sds = np.concatenate([self._sds, self._own_sds])
+        self._moves: Array | None = None  # derivatives by the times of the inputs' moves, once they are known
 
     def climb(self, theta: Array) -> Fitted | None:
         """Steps from a nuisance, and from a smaller size where the first diverges."""
@@ -165,10 +169,9 @@ class _Fit:
         point = next((item for own in starts if (item := self._evaluate(theta, own)) is not None), None)
         if point is None:
             return None
-        damping = 1e-3
+        damping, equations = 1e-3, self._normal_equations(point)
         for _ in range(STEPS):
-            _, _, information, gradient = self._normal_equations(point)
-            before = point
+            before, (_, _, information, gradient) = point, equations
             for _ in range(TRIES):
                 damped = information + damping * np.diag(np.diag(information))
                 step = np.asarray(np.linalg.solve(damped, gradient), dtype=float)
@@ -177,9 +180,11 @@ class _Fit:
                     point, damping = other, 0.1 * damping
                     break
                 damping = max(10.0 * damping, 1e-6)
+            if point is not before:
+                equations = self._normal_equations(point)
             if before.loss - point.loss < CONVERGED:
                 break
-        return self._result(point)
+        return self._result(point, *equations[:3])
 
     def _move(self, point: _Point, step: Array) -> tuple[Array, Array]:
         """Parameters after a step in the trust region and within their bounds."""
@@ -203,9 +208,8 @@ class _Fit:
         else:
             sizes = self._walk @ own
             course = Deviation(hats.mean @ sizes, hats.value @ sizes)
-        result = Deviation(*(np.zeros_like(self._nuisance.simulation.no_deviation().mean) for _ in range(2)))
-        result.mean[:, index], result.value[:, index] = course.mean, course.value
-        return result
+        is_cause = np.arange(self._nuisance.simulation.typical.size) == index
+        return Deviation(np.outer(course.mean, is_cause), np.outer(course.value, is_cause))
 
     def _evaluate(self, theta: Array, own: Array) -> _Point | None:
         simulated = self._nuisance.simulate(theta, self._deviation(own))
@@ -217,8 +221,6 @@ class _Fit:
         loss = 0.5 * float(np.sum(white**2)) + 0.5 * float(np.sum((theta / self._sds) ** 2))
         centred = own / self._own_sds if not self._is_timed else own[:1] / self._own_sds[:1]
         return _Point(theta, own, loss + 0.5 * float(np.sum(centred**2)), residual, white, simulated)
-
-    _moves: Array | None = None
 
     def _moves_effect(self, theta: Array) -> Array:
         """Effect of the times of the inputs' moves, which is linear in them."""
@@ -262,8 +264,7 @@ class _Fit:
         starts = np.zeros((parts, n_x, mean.shape[1]))
         return self._nuisance.derivatives(point.theta, slopes, starts, forcing)
 
-    def _result(self, point: _Point) -> Fitted:
-        derivatives, white, information, _ = self._normal_equations(point)
+    def _result(self, point: _Point, derivatives: Array, white: Array, information: Array) -> Fitted:
         flat = white.reshape(-1, white.shape[-1])
         scaled = np.eye(self._all_sds.size) + self._all_sds[:, None] * (flat.T @ flat) * self._all_sds
         evidence = -point.loss - 0.5 * float(np.linalg.slogdet(scaled)[1])
@@ -285,7 +286,6 @@ class _Fit:
             hypothesis._replace(log_evidence=evidence),
             point.theta,
             curve,
-            evidence,
             point.residual,
             point.simulated,
             size_sd,

@@ -21,6 +21,7 @@ import numpy as np
 
 from reactorwatch.arrays import Array
 from reactorwatch.diagnosis.inexact.simulation import Deviation, Forcing, InexactSimulation, Simulated, Slopes
+from reactorwatch.diagnosis.run import Run
 from reactorwatch.process.effect import Effect, ParameterEffect, ParameterShift
 
 SHORTEST_MIN = 0.1
@@ -46,6 +47,11 @@ class Prior(NamedTuple):
 
 PRIORS = tuple(Prior(*item) for item in product((0.003, 0.1, 0.3, 1.0), (0.003, 1.0), (False, True)))
 """Priors that are compared."""
+
+
+def time_sd_min(run: Run, *, is_lag: bool = False) -> float:
+    """Standard deviation of the prior of a delay or a lag, for lambda 1."""
+    return (LAG_SHARE if is_lag else 1.0) * max(SHORTEST_MIN, run.period_min)
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +83,7 @@ class Nuisance:
 
     def __init__(self, simulation: InexactSimulation, starts: Array, stated: Mapping[str, float]) -> None:
         self.simulation, self._usual_starts, self._stated = simulation, starts, stated
-        model, run = simulation.model, simulation.run
+        model = simulation.model
         n_x, n_u, n_y = len(model.states), len(model.inputs), len(model.outputs)
         self._moves = self._find_moves()
         counts = (n_x * len(starts), len(simulation.effects), n_u, n_u, n_y, n_y, len(self._moves))
@@ -97,7 +103,6 @@ class Nuisance:
             *(f"{name}.lag" for name in outputs),
             *(f"{inputs[j]}.move" for _, j in self._moves),
         )
-        self._clock_min = max(SHORTEST_MIN, run.period_min)
         self.lower = np.full(self.size, -np.inf)
         self.lower[self.input_lags] = self.lower[self.output_lags] = 0.0
         self.upper = np.full(self.size, np.inf)
@@ -118,7 +123,7 @@ class Nuisance:
     @property
     def lag_start_min(self) -> float:
         """Lag from which a fit may start: that of a slow sensor."""
-        return 2.0 * self._clock_min
+        return 2.0 * time_sd_min(self.simulation.run)
 
     def sds(self, prior: Prior) -> Array:
         """Standard deviation of each nuisance's prior, shape (size,)."""
@@ -129,8 +134,9 @@ class Nuisance:
             sd if (stated := self._stated_sd(effect)) is None else max(stated, EXACT * abs(effect.typical))
             for effect, sd in zip(self.simulation.effects, typical.tolist(), strict=True)
         ]
-        result[self.input_delays] = result[self.output_delays] = prior.lam * self._clock_min
-        result[self.input_lags] = result[self.output_lags] = prior.lam * LAG_SHARE * self._clock_min
+        run = self.simulation.run
+        result[self.input_delays] = result[self.output_delays] = prior.lam * time_sd_min(run)
+        result[self.input_lags] = result[self.output_lags] = prior.lam * time_sd_min(run, is_lag=True)
         result[self.moves] = 12.0**-0.5 if prior.moves else EXACT
         return result
 
