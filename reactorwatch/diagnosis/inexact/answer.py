@@ -106,7 +106,7 @@ def curves_with(item: Explanation, explained: Explained, curves: Curves) -> Curv
         if fitted.hypothesis.kind == CONSTANT:
             deviation[item.effect.name] = np.full(len(after), fitted.hypothesis.size)
         else:
-            course = fitted.simulated.deviation.value[:, fitted.hypothesis.effect]
+            course = fitted.simulated.deviation.sample_value[:, fitted.hypothesis.effect]
             deviation[item.effect.name] = course - fitted.theta[nuisance.effects][fitted.hypothesis.effect]
     known = {name: np.full(len(after), item.size_sd) for name in deviation}
     return replace(

@@ -18,13 +18,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reactorwatch.arrays import Array
+from reactorwatch.diagnosis.fitting.profiles import Signal
 from reactorwatch.diagnosis.holdout import EVERY, blocks_of, excess, rms, share_of
 from reactorwatch.diagnosis.inexact.fit import Fitted, Fitter
 from reactorwatch.diagnosis.inexact.hypotheses import CONSTANT, CURVE, NONE, RAMP, STEP, WIDTH, Courses, Hypothesis
 from reactorwatch.diagnosis.inexact.noise import Discrepancy, estimate_discrepancy, white, white_noise_sd
 from reactorwatch.diagnosis.inexact.nuisance import Nuisance
 from reactorwatch.diagnosis.inexact.screen import Screen
-from reactorwatch.diagnosis.inexact.simulation import Deviation, InexactSimulation, ProductForcing, Simulated
+from reactorwatch.diagnosis.inexact.simulation import InexactSimulation, ProductForcing, Simulated
 from reactorwatch.diagnosis.run import Run
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.model import ProcessModel
@@ -180,8 +181,10 @@ class _Comparison:
         sim, nuisance = self._simulation, self._nuisance
         found = nuisance.linearise(theta, simulated)
         steps, hats = self._courses.steps(), self._courses.hats()
-        courses = Deviation(np.hstack([steps.mean, hats.mean]), np.hstack([steps.value, hats.value]))
-        starts = np.zeros((len(sim.begins), len(sim.model.states), len(sim.effects) * courses.mean.shape[1]))
+        courses = Signal(
+            np.hstack([steps.interval_mean, hats.interval_mean]), np.hstack([steps.sample_value, hats.sample_value])
+        )
+        starts = np.zeros((len(sim.begins), len(sim.model.states), len(sim.effects) * courses.interval_mean.shape[1]))
         causes = nuisance.derivatives(theta, found.slopes, starts, ProductForcing(courses))
         whitened = noise.whiten(self._fitter.residual(theta, simulated))
         base, causes = (noise.whiten(self._fitter.mask(item)) for item in (found.nuisance, causes))

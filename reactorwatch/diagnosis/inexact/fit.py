@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reactorwatch.arrays import Array
+from reactorwatch.diagnosis.fitting.profiles import Signal
 from reactorwatch.diagnosis.inexact.hypotheses import (
     CONSTANT,
     CURVE,
@@ -27,7 +28,7 @@ from reactorwatch.diagnosis.inexact.hypotheses import (
 )
 from reactorwatch.diagnosis.inexact.noise import Discrepancy
 from reactorwatch.diagnosis.inexact.nuisance import Linearised, Nuisance
-from reactorwatch.diagnosis.inexact.simulation import Deviation, Forcing, Simulated
+from reactorwatch.diagnosis.inexact.simulation import Forcing, Simulated
 
 STEPS, TRIES = 8, 6
 """Steps of a fit, and dampings that are tried in each."""
@@ -197,19 +198,19 @@ class _Fit:
         nuisance = self._nuisance
         return np.clip(point.theta + step[:n], nuisance.lower, nuisance.upper), np.clip(own, self._lower, self._upper)
 
-    def _deviation(self, own: Array) -> Deviation | None:
+    def _deviation(self, own: Array) -> Signal | None:
         """Deviations of all effects; None without any."""
         if not own.size:
             return None
         hats, index = self._fitter._hats, self._hypothesis.effect
         if self._is_timed:
             course = self._fitter._courses.course(self._hypothesis.kind, float(own[1]))
-            course = Deviation(own[0] * course.mean, own[0] * course.value)
+            course = Signal(own[0] * course.interval_mean, own[0] * course.sample_value)
         else:
             sizes = self._walk @ own
-            course = Deviation(hats.mean @ sizes, hats.value @ sizes)
+            course = Signal(hats.interval_mean @ sizes, hats.sample_value @ sizes)
         is_cause = np.arange(self._nuisance.simulation.typical.size) == index
-        return Deviation(np.outer(course.mean, is_cause), np.outer(course.value, is_cause))
+        return Signal(np.outer(course.interval_mean, is_cause), np.outer(course.sample_value, is_cause))
 
     def _evaluate(self, theta: Array, own: Array) -> _Point | None:
         simulated = self._nuisance.simulate(theta, self._deviation(own))
@@ -254,10 +255,11 @@ class _Fit:
             onset, size = float(point.own[1]), float(point.own[0])
             one, other = courses.course(kind, onset), courses.by_onset(kind, onset)
             mean, value = (
-                np.column_stack([getattr(one, name), size * getattr(other, name)]) for name in ("mean", "value")
+                np.column_stack([getattr(one, name), size * getattr(other, name)])
+                for name in ("interval_mean", "sample_value")
             )
         else:
-            mean, value = self._fitter._hats.mean @ self._walk, self._fitter._hats.value @ self._walk
+            mean, value = self._fitter._hats.interval_mean @ self._walk, self._fitter._hats.sample_value @ self._walk
         slopes = found.slopes
         forcing = Forcing(slopes.b[:, :, index, None] * mean[:-1, None], slopes.d[:, :, index, None] * value[:, None])
         parts, n_x = len(self._nuisance.simulation.begins), slopes.a.shape[1]

@@ -10,8 +10,8 @@ from typing import NamedTuple
 import numpy as np
 
 from reactorwatch.arrays import Array
+from reactorwatch.diagnosis.fitting.profiles import Signal
 from reactorwatch.diagnosis.inexact.nuisance import Prior
-from reactorwatch.diagnosis.inexact.simulation import Deviation
 
 ONSETS, KNOTS = 24, 25
 """Onsets at which a step or a ramp is tried, and knots of a curve, over the record."""
@@ -88,33 +88,37 @@ class Courses:
         """Times of a curve's knots, shape (KNOTS,)."""
         return np.linspace(self.time_min[0], self.time_min[-1], KNOTS)
 
-    def course(self, kind: str, onset: float) -> Deviation:
+    def course(self, kind: str, onset: float) -> Signal:
         """Course of a step, of size 1, or a ramp that reaches 1 at the end of the run."""
         begin, end = self.time_min, np.append(self.time_min[1:], self.time_min[-1] + self.period_min)
         if kind == STEP:
             mean = np.clip((end - onset) / (end - begin), 0.0, 1.0)
-            return Deviation(mean, (begin >= onset).astype(float))
+            return Signal(mean, (begin >= onset).astype(float))
         span = max(float(self.time_min[-1]) - onset, self.period_min)
         late = [np.maximum(item - onset, 0.0) / span for item in (begin, end)]
-        return Deviation(0.5 * (late[0] + late[1]), late[0])
+        return Signal(0.5 * (late[0] + late[1]), late[0])
 
-    def by_onset(self, kind: str, onset: float) -> Deviation:
+    def by_onset(self, kind: str, onset: float) -> Signal:
         """Derivative of a course by its onset; a sensor's step jumps, so its derivative is that over a row."""
         half = 0.5 * self.period_min
         ahead, behind = self.course(kind, onset + half), self.course(kind, onset - half)
-        mean, value = ((a - b) / (2.0 * half) for a, b in ((ahead.mean, behind.mean), (ahead.value, behind.value)))
-        return Deviation(mean, value)
+        mean, value = (
+            (a - b) / (2.0 * half)
+            for a, b in ((ahead.interval_mean, behind.interval_mean), (ahead.sample_value, behind.sample_value))
+        )
+        return Signal(mean, value)
 
-    def hats(self) -> Deviation:
+    def hats(self) -> Signal:
         """Functions that are 1 at a knot and 0 at the others, shape (rows, KNOTS)."""
         times, knots = self.time_min, self.knots
         value = np.maximum(0.0, 1.0 - np.abs(times[:, None] - knots) / (knots[1] - knots[0]))
-        return Deviation(np.vstack([0.5 * (value[:-1] + value[1:]), value[-1:]]), value)
+        return Signal(np.vstack([0.5 * (value[:-1] + value[1:]), value[-1:]]), value)
 
-    def steps(self) -> Deviation:
+    def steps(self) -> Signal:
         """Steps at all onsets, shape (rows, onsets)."""
         each = [self.course(STEP, onset) for onset in self.onsets.tolist()]
-        return Deviation(*(np.column_stack([getattr(item, name) for item in each]) for name in ("mean", "value")))
+        mean, value = np.column_stack([item.interval_mean for item in each]), [item.sample_value for item in each]
+        return Signal(mean, np.column_stack(value))
 
     def ramp_weights(self) -> Array:
         """Weights of the hats whose sum is a ramp from each onset, shape (KNOTS, onsets)."""

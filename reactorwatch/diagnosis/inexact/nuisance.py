@@ -20,7 +20,8 @@ from typing import NamedTuple
 import numpy as np
 
 from reactorwatch.arrays import Array
-from reactorwatch.diagnosis.inexact.simulation import Deviation, Forcing, InexactSimulation, Simulated, Slopes
+from reactorwatch.diagnosis.fitting.profiles import Signal
+from reactorwatch.diagnosis.inexact.simulation import Forcing, InexactSimulation, Simulated, Slopes
 from reactorwatch.diagnosis.run import Run
 from reactorwatch.process.effect import Effect, ParameterEffect, ParameterShift
 
@@ -147,12 +148,12 @@ class Nuisance:
         scale = abs(self.simulation.model.parameter(effect.parameter).value) if effect.unit == "1" else 1.0
         return self._stated[effect.parameter] / scale if scale else None
 
-    def simulate(self, theta: Array, deviation: Deviation | None = None) -> Simulated | None:
+    def simulate(self, theta: Array, deviation: Signal | None = None) -> Simulated | None:
         """Simulate with nuisance and further deviations of the effects; None if it diverges."""
         constant = np.tile(theta[self.effects], (self.simulation.run.time_min.size, 1))
-        both = Deviation(constant, constant)
+        both = Signal(constant, constant)
         if deviation is not None:
-            both = Deviation(constant + deviation.mean, constant + deviation.value)
+            both = Signal(constant + deviation.interval_mean, constant + deviation.sample_value)
         starts = self._usual_starts + theta[self.starts].reshape(self._usual_starts.shape)
         inputs = self.simulation.drive(theta[self.input_delays], theta[self.input_lags])
         return self.simulation.simulate(starts, inputs, both)

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from reactorwatch.arrays import Array
+from reactorwatch.diagnosis.fitting.profiles import Signal
 from reactorwatch.diagnosis.run import Run
 from reactorwatch.process.effect import TIMING, Effect
 from reactorwatch.process.model import ProcessModel
@@ -36,19 +37,6 @@ MOST_ROWS = 1500
 
 
 @dataclass(frozen=True, eq=False)
-class Deviation:
-    """Deviations of all effects from their neutral sizes, shape (rows, n) or (rows,) for one.
-
-    Attributes:
-        mean: mean from each row to the next.
-        value: value at each row.
-    """
-
-    mean: Array
-    value: Array
-
-
-@dataclass(frozen=True, eq=False)
 class Simulated:
     """A simulation: states (rows, n_x), true outputs and errors of the sensors (rows, n_y), and what drove it."""
 
@@ -56,7 +44,7 @@ class Simulated:
     true: Array
     errors: Array
     inputs: Array
-    deviation: Deviation
+    deviation: Signal
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,12 +140,12 @@ class InexactSimulation:
                 break
             coarse = fine
 
-    def no_deviation(self) -> Deviation:
+    def no_deviation(self) -> Signal:
         """All effects at their neutral sizes."""
         nothing = np.zeros((self.run.time_min.size, len(self.effects)))
-        return Deviation(nothing, nothing)
+        return Signal(nothing, nothing)
 
-    def simulate(self, starts: Array, inputs: Array, deviation: Deviation) -> Simulated | None:
+    def simulate(self, starts: Array, inputs: Array, deviation: Signal) -> Simulated | None:
         """Simulate; None if it diverges.
 
         Args:
@@ -166,7 +154,7 @@ class InexactSimulation:
             deviation: deviations of all effects.
         """
         rows = self.run.time_min.size
-        x, eta = np.empty((rows, len(self.model.states))), self._neutral + deviation.mean[:-1]
+        x, eta = np.empty((rows, len(self.model.states))), self._neutral + deviation.interval_mean[:-1]
         for start, (begin, end) in zip(starts, pairwise((*self.begins, rows)), strict=True):
             x[begin] = start
             if end - begin > 1:
@@ -178,7 +166,7 @@ class InexactSimulation:
             return None
         shown, where = self._function_for(self._output, rows), (x.T, self.run.inputs.T)
         true = np.array(shown(*where, np.tile(self._neutral[:, None], rows), self.run.time_min)).T
-        y = np.array(shown(*where, (self._neutral + deviation.value).T, self.run.time_min)).T
+        y = np.array(shown(*where, (self._neutral + deviation.sample_value).T, self.run.time_min)).T
         return Simulated(x, true, y - true, inputs, deviation) if np.all(np.isfinite(y)) else None
 
     def _arguments(self, inputs: Array, eta: Array, part: slice) -> tuple[Array, ...]:
@@ -190,7 +178,7 @@ class InexactSimulation:
     def slopes(self, simulated: Simulated) -> Slopes:
         """Derivatives along a simulation."""
         rows, n = self.run.time_min.size, self._steps
-        eta = self._neutral + simulated.deviation.mean[:-1]
+        eta = self._neutral + simulated.deviation.interval_mean[:-1]
         arguments = self._arguments(simulated.inputs, eta, slice(None))
         states = [simulated.x[:-1]]
         each, all_rows = (
@@ -204,7 +192,7 @@ class InexactSimulation:
             found = self._function_for(self._step_slopes, rows - 1)(x.T, *(item[..., step] for item in all_rows))
             a, b, g = (_by_row(item, rows - 1) for item in found)
             result = (a @ result[0], a @ result[1] + b, a @ result[2] + g) if result else (a, b, g)
-        sizes = (self._neutral + simulated.deviation.value).T
+        sizes = (self._neutral + simulated.deviation.sample_value).T
         shown = self._function_for(self._output_slopes, rows)(
             simulated.x.T, self.run.inputs.T, sizes, self.run.time_min
         )
@@ -296,17 +284,17 @@ class Forcing:
 class ProductForcing(Forcing):
     """Every effect in every one of some courses in time; the columns are ordered by effect, then by course."""
 
-    def __init__(self, courses: Deviation) -> None:
+    def __init__(self, courses: Signal) -> None:
         self._courses = courses
 
     def on_states(self, slopes: Slopes, row: int) -> Array:
         """See `Forcing`."""
-        products = slopes.b[row][:, :, None] * self._courses.mean[row]
+        products = slopes.b[row][:, :, None] * self._courses.interval_mean[row]
         return np.asarray(products.reshape(len(products), -1))
 
     def on_sensors(self, slopes: Slopes, rows: NDArray[np.intp]) -> Array:
         """See `Forcing`."""
-        products = slopes.d[rows][..., None] * self._courses.value[rows][:, None, None, :]
+        products = slopes.d[rows][..., None] * self._courses.sample_value[rows][:, None, None, :]
         return np.asarray(products.reshape(rows.size, slopes.d.shape[1], -1))
 
 

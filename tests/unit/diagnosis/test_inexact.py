@@ -12,12 +12,13 @@ from benchmarks.inexact import two_heaters
 from benchmarks.inexact.records import Drawn, write_files
 from reactorwatch.api.diagnosis import diagnose
 from reactorwatch.api.records import read_record
+from reactorwatch.diagnosis.fitting.profiles import Signal
 from reactorwatch.diagnosis.inexact.explain import explain
 from reactorwatch.diagnosis.inexact.hypotheses import CONSTANT, STEP, WIDTH, Courses
 from reactorwatch.diagnosis.inexact.noise import estimate_discrepancy
 from reactorwatch.diagnosis.inexact.nuisance import Nuisance, Prior
 from reactorwatch.diagnosis.inexact.screen import Screen
-from reactorwatch.diagnosis.inexact.simulation import Deviation, InexactSimulation, ProductForcing
+from reactorwatch.diagnosis.inexact.simulation import InexactSimulation, ProductForcing
 from reactorwatch.diagnosis.run import Run
 from reactorwatch.process import effects_of
 from reactorwatch.process.library.cascaded_tanks import tanks
@@ -83,12 +84,14 @@ def test_the_derivatives_by_a_step_of_every_effect_are_differences_of_simulation
     assert simulated is not None
     found = nuisance.linearise(theta, simulated)
     course = Courses(TIME, PERIOD_MIN).course(STEP, 7.03)
-    forcing = ProductForcing(Deviation(course.mean[:, None], course.value[:, None]))
+    forcing = ProductForcing(Signal(course.interval_mean[:, None], course.sample_value[:, None]))
     starts = np.zeros((1, simulated.x.shape[1], simulation.typical.size))
     derivatives = nuisance.derivatives(theta, found.slopes, starts, forcing)
     for index, typical in enumerate(simulation.typical.tolist()):
         sizes = np.where(np.arange(simulation.typical.size) == index, 1e-4 * typical, 0.0)
-        other = nuisance.simulate(theta, Deviation(np.outer(course.mean, sizes), np.outer(course.value, sizes)))
+        other = nuisance.simulate(
+            theta, Signal(np.outer(course.interval_mean, sizes), np.outer(course.sample_value, sizes))
+        )
         assert other is not None
         difference = (nuisance.read(other, theta) - found.read) / (1e-4 * typical)
         assert difference == pytest.approx(
