@@ -32,7 +32,6 @@ from reactorwatch.diagnosis.graded import (
     effect_sizes,
     left_in_tolerances,
     list_causes,
-    main_causes,
     nearest_of,
     remaining_of,
     separate_corrections,
@@ -63,12 +62,12 @@ from reactorwatch.diagnosis.result import (
     UNKNOWN,
     Adequacy,
     Alternative,
+    Cause,
     Curves,
     Diagnosis,
     Gain,
     HeldOut,
     LocationEvidence,
-    Nuisance,
 )
 from reactorwatch.diagnosis.run import Run
 from reactorwatch.diagnosis.search.noise import search_noise_growth, search_single_cause
@@ -194,7 +193,19 @@ def diagnose(
     causes = convert_to_run_minutes(hypothesis_causes(best, covariances), record) if law is None else ()
     parameters = adjusted_parameters(run, model, uncertain or {}, best, None if lasting is None else lasting.sds)
     adjusted = model.with_values({name: item.estimate.value for name, item in parameters.items()})
-    alternatives = _alternatives(result, best)
+    alternatives, nearest = _alternatives(result, best), nearest_of(result, best if law is None else result.nominal)
+    listed, tolerated = list(dict.fromkeys([*nearest, *alternatives])), np.array([bands[i] for i in model.output_names])
+    weights = dict(zip(listed, weights_of(listed, result.nominal, run, before, noise_sd), strict=True))
+    parts = {
+        item: separate_corrections(
+            causes if item is best else _causes_of(item, run, record), effect_sizes(item, run, tolerated), effects
+        )
+        for item in listed
+    }
+    shown, corrections = parts[best] if causes else ((), ())
+    if verdict == AMBIGUOUS and corrections:
+        alternatives = [item for item in alternatives if _names(parts[item][0]) != _names(shown)]
+        verdict = AMBIGUOUS if any(item.bic - best.bic < SURE for item in alternatives) else NAMED
     experiment = (
         propose_experiment([best, *alternatives], run, model, result.noise, limits or {})
         if alternatives and law is None
@@ -210,33 +221,7 @@ def diagnose(
         else describe_law(adjusted, run, unknown.found, reported, covariances, gain.held_out)
     )
     worse = _locations(best, alternatives) if unknown is None else unknown.locations
-    tolerated = np.array([bands[name] for name in model.output_names])
-    nearest = nearest_of(result, best if law is None else result.nominal)
-    weights = weights_of(nearest, result.nominal, run, before, noise_sd)
-    listed = list_causes([main_causes(item, run, record, tolerated, effects) for item in nearest], weights)
-    share = weights[0].share if weights else 0.0
-    shown, corrections = tuple(causes), tuple[Nuisance, ...]()
-    if causes:
-        causes = weights[0].of(causes)
-        shown, corrections = separate_corrections(causes, effect_sizes(best, run, tolerated), effects)
-    if verdict == AMBIGUOUS and corrections:
-        names = {item.cause for item in shown}
-        alternatives = [
-            item
-            for item in alternatives
-            if {each.cause for each in main_causes(item, run, record, tolerated, effects)} != names
-        ]
-        verdict = AMBIGUOUS if any(item.bic - best.bic < SURE for item in alternatives) else NAMED
-    described_alternatives = [
-        structs.replace(
-            _alternative(search, item, result.noise, best.bic, record),
-            share=weight.share,
-            probability=weight.probability,
-        )
-        for item, weight in zip(
-            alternatives, weights_of(alternatives, result.nominal, run, before, noise_sd), strict=True
-        )
-    ]
+    share = weights[nearest[0]].share if nearest else 0.0
     exact = Diagnosis(
         file=record.name,
         zero=record.zero,
@@ -246,9 +231,12 @@ def diagnose(
         seconds=0.0,
         verdict=verdict,
         grade=grade_of(verdict, share, left_in_tolerances(gain.held_out, bands)),
-        causes=shown,
-        alternatives=tuple(described_alternatives),
-        nearest=listed,
+        causes=weights[best].of(shown) if causes else (),
+        alternatives=tuple(
+            structs.replace(_alternative(search, item, result.noise, best.bic, record), **weights[item]._asdict())
+            for item in alternatives
+        ),
+        nearest=list_causes([parts[item][0] for item in nearest], [weights[item] for item in nearest]),
         onset=onset_of(causes),
         nuisance=corrections,
         remaining=remaining_of(gain.held_out, location if verdict == UNKNOWN else None),
@@ -272,6 +260,15 @@ def diagnose(
     if explained is None:
         return exact
     return with_nuisance(exact, explained, model, effects, record, bands, uncertain or {})
+
+
+def _causes_of(item: FittedHypothesis, run: Run, record: Record) -> tuple[Cause, ...]:
+    """Causes of a hypothesis, their parameters as fitted."""
+    return convert_to_run_minutes(hypothesis_causes(item, covariances_of(run, item)), record)
+
+
+def _names(causes: Sequence[Cause]) -> set[str]:
+    return {item.cause for item in causes}
 
 
 def _calls_for_nuisance(

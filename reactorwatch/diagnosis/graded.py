@@ -10,9 +10,7 @@ from reactorwatch.arrays import Array
 from reactorwatch.diagnosis.decide import Verdict, decide
 from reactorwatch.diagnosis.estimates import (
     convert_to_run_minutes,
-    covariances_of,
     extended_model,
-    hypothesis_causes,
 )
 from reactorwatch.diagnosis.holdout import Errors, excess, rms, share_of, simulate_outputs
 from reactorwatch.diagnosis.inexact import answer
@@ -98,14 +96,6 @@ def nearest_of(result: SearchResult, best: FittedHypothesis) -> list[FittedHypot
     for item in ordered:
         first.setdefault(frozenset(item.hypothesis.causes), item)
     return list(first.values())[:MOST_NEAREST]
-
-
-def main_causes(
-    item: FittedHypothesis, run: Run, record: Record, tolerances: Array, effects: Sequence[Effect]
-) -> tuple[Cause, ...]:
-    """Causes of a hypothesis without small corrections, that with the largest effect first."""
-    causes = convert_to_run_minutes(hypothesis_causes(item, covariances_of(run, item)), record)
-    return separate_corrections(causes, effect_sizes(item, run, tolerances), effects)[0]
 
 
 def list_causes(explanations: Sequence[tuple[Cause, ...]], weights: Sequence[Weight]) -> tuple[Cause, ...]:
@@ -280,7 +270,7 @@ def _parameters(
         known = model.parameter(effect.parameter)
         eta, sd = float(item.fitted.theta[index]), float(item.fitted.theta_sd[index])
         scale = abs(known.value) if isinstance(effect, ParameterEffect) else 1.0
-        value, stated = effect.changed(known.value, eta), uncertain[effect.parameter]
+        value, stated = effect.deviate(known.value, eta), uncertain[effect.parameter]
         result[effect.parameter] = AdjustedParameter(known.value, stated, value, scale * sd, known.unit)
     return result
 

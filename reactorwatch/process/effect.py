@@ -210,11 +210,11 @@ class ParameterEffect(Effect):
         """See `Effect`."""
         for name in (self.parameter, *self.proportional):
             symbol = model.parameter(name).symbol
-            model = model.substitute(symbol, self.changed(symbol, size))
+            model = model.substitute(symbol, self.deviate(symbol, size))
         return model
 
-    def changed(self, value: Any, size: Any) -> Any:
-        """A parameter's value with a deviation, as a number or an expression."""
+    def deviate(self, value: Any, size: Any) -> Any:
+        """Value of a parameter with a deviation, as a number or an expression."""
         return value * (1 + (-size if self.is_loss else size))
 
 
@@ -226,9 +226,9 @@ class ParameterShift(Effect):
     def apply(self, model: ProcessModel, size: ca.SX) -> ProcessModel:
         """See `Effect`."""
         symbol = model.parameter(self.parameter).symbol
-        return model.substitute(symbol, self.changed(symbol, size))
+        return model.substitute(symbol, self.deviate(symbol, size))
 
-    def changed(self, value: Any, size: Any) -> Any:
+    def deviate(self, value: Any, size: Any) -> Any:
         """See `ParameterEffect`."""
         return value + size
 

@@ -59,7 +59,7 @@ def _own_factor(item: Explanation, explained: Explained) -> float:
     hypothesis, nuisance = item.fitted.hypothesis, explained.nuisance
     if hypothesis.kind == CONSTANT or not isinstance(item.effect, ParameterEffect):
         return 1.0
-    return float(item.effect.changed(1.0, float(item.fitted.theta[nuisance.effects.start + hypothesis.effect])))
+    return float(item.effect.deviate(1.0, float(item.fitted.theta[nuisance.effects.start + hypothesis.effect])))
 
 
 def nuisance_of(item: Explanation, explained: Explained) -> tuple[Nuisance, ...]:
@@ -90,7 +90,7 @@ def adjusted_model(item: Explanation, explained: Explained, model: ProcessModel)
         proportional = effect.proportional if isinstance(effect, ParameterEffect) else ()
         for name in (effect.parameter, *proportional):
             known = model.parameter(name)
-            value = float(effect.changed(values.get(name, known.value), eta))
+            value = float(effect.deviate(values.get(name, known.value), eta))
             values[name] = min(max(value, known.lower), known.upper)
     return model.with_values(values)
 
