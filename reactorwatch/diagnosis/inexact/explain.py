@@ -226,8 +226,8 @@ class _Comparison:
         total = sum(exp(item.log_evidence - top) for item in fits)
         result: list[Explanation] = []
         for item in sorted(fits, key=lambda item: -item.log_evidence):
-            hidden = self._hidden_rows(item)
-            before, after = (self._error(each, hidden) for each in (none, item))
+            folds = self._folds(item.hypothesis)
+            before, after = (self._error(each, folds) for each in (none, item))
             share, left = share_of(before, after, noise_sd), excess(after, noise_sd)
             effect = None if item is none else self._effect(item.hypothesis)
             prior = item.hypothesis.prior
@@ -243,17 +243,23 @@ class _Comparison:
             return self._causes[hypothesis.effect]
         return self._simulation.effects[hypothesis.effect]
 
-    def _hidden_rows(self, item: Fitted) -> NDArray[np.bool_]:
-        """Kept rows that are held out; those about the onset are not, because no others determine it."""
-        first = EVERY - 1
-        if item.hypothesis.kind in (STEP, RAMP):
-            first -= int(blocks_of(self._run, np.array(item.hypothesis.onset)) % EVERY == first)
-        return np.asarray(blocks_of(self._run, self._run.time_min[self._rows]) % EVERY == first)
+    def _folds(self, hypothesis: Hypothesis) -> list[NDArray[np.bool_]]:
+        """Masks of the kept rows, each to be predicted from all others; together they are all rows but a few.
 
-    def _error(self, item: Fitted, hidden: NDArray[np.bool_]) -> Array:
-        """Root mean square error on held-out rows, by output."""
-        known = np.isfinite(self._run.measured[self._rows][hidden])
-        return np.nan_to_num(rms(np.where(known, item.residual_without(hidden)[hidden], np.nan)))
+        Blocks in which the plant starts, or the cause sets in, are in none, because no others determine that.
+        """
+        run = self._run
+        block, begins = blocks_of(run, run.time_min[self._rows]), run.time_min[list(self._simulation.begins)]
+        onset = [hypothesis.onset] if hypothesis.kind in (STEP, RAMP) else []
+        foldable = ~np.isin(block, blocks_of(run, np.append(begins, onset)))
+        return [foldable & (block % EVERY == fold) for fold in range(EVERY)]
+
+    def _error(self, item: Fitted, folds: Sequence[NDArray[np.bool_]]) -> Array:
+        """Root mean square error of the predictions of the folds, by output."""
+        known, errors = np.isfinite(self._run.measured[self._rows]), np.full(item.residual.shape, np.nan)
+        for fold in folds:
+            errors[fold] = item.residual_without(fold)
+        return np.nan_to_num(rms(np.where(known, errors, np.nan)))
 
     def _effect_size(self, item: Fitted) -> Array:
         """Root mean square difference between the simulations with and without the cause, by output."""

@@ -81,11 +81,11 @@ class Fitted:
         return self.hypothesis.log_evidence
 
     def residual_without(self, hidden: NDArray[np.bool_]) -> Array:
-        """Residual at the kept rows of a fit to the others than these, by the derivatives of this fit."""
+        """Residual at these of the kept rows of a fit to the others, by the derivatives of this fit."""
         part, unexplained = self.white[hidden].reshape(-1, len(self.information)), self.white_residual[hidden].ravel()
         # the fit ends where the gradient of all rows is 0, so without some of them it is theirs
         step = np.linalg.solve(self.information - part.T @ part, part.T @ unexplained)
-        return np.asarray(self.residual + self.derivatives @ step)
+        return np.asarray(self.residual[hidden] + self.derivatives[hidden] @ step)
 
 
 @dataclass(frozen=True, eq=False)
