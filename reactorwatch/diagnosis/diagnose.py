@@ -136,7 +136,8 @@ def diagnose(
     found = _search_evidence(result, best, adequacy)
     verdict = decide_without_nuisance(found, None)
     location = best.hypothesis.filter.effects[0].location if best.label else ""
-    remarks = [*_describe_record(record), *_describe_outliers(whole, run)]
+    about_record = [*_describe_record(record), *_describe_outliers(whole, run)]
+    remarks = [*about_record]
     unknown: Localised | None = None
     if verdict == UNKNOWN or not found.is_white or (best.label and _may_be_unknown(result, best, model)):
         white = best.label and verdict != UNKNOWN and found.is_white and not _seems_noisy(result, model)
@@ -259,7 +260,8 @@ def diagnose(
     explained = explain(model, effects, run, _starts(run, result.nominal, model), uncertain or {}, smallest_sd)
     if explained is None:
         return exact
-    return with_nuisance(exact, explained, model, effects, record, bands, uncertain or {})
+    answer = with_nuisance(exact, explained, model, effects, record, bands, uncertain or {})
+    return structs.replace(answer, remarks=tuple(about_record)) if answer.with_nuisance else answer
 
 
 def _causes_of(item: FittedHypothesis, run: Run, record: Record) -> tuple[Cause, ...]:

@@ -21,7 +21,6 @@ from reactorwatch.process.profiles import FREE_NAME, PROFILES
 from reactorwatch.sentences.diagnosis import (
     describe_causes,
     describe_difference,
-    describe_location,
     describe_parameter,
     describe_place,
     describe_size,
@@ -78,7 +77,7 @@ def as_page(
         diagnosis=diagnosis,
         file=file,
         verdict=describe_verdict(diagnosis, are_listed=True),
-        place=describe_location(diagnosis) if diagnosis.verdict != NOMINAL else "",
+        place="" if diagnosis.verdict == NOMINAL else describe_place(diagnosis.location or "record"),
         alternatives=rivals,
         where=describe_place,
         when=describe_timing,
