@@ -385,7 +385,7 @@ def _alternatives(diagnosis: "Diagnosis", effects: Sequence[Effect]) -> list[str
 
 
 def describe_rival(item: "Alternative", diagnosis: "Diagnosis") -> str:
-    """How an alternative compares with the best explanation."""
+    """Comparison of an alternative with the best explanation."""
     if not diagnosis.with_nuisance:
         return f"worse by {item.delta_bic:.1f} in BIC"
     return "which acts the same in this record" if acts_alike(item) else f"which {describe_weight(item)}"
