@@ -24,6 +24,7 @@ if TYPE_CHECKING:
         HeldOut,
         Law,
         Nuisance,
+        Remaining,
     )
 
 INDENT = 14
@@ -77,24 +78,36 @@ def describe_verdict(diagnosis: "Diagnosis", *, are_listed: bool = False) -> str
 
 def describe_nuisance(diagnosis: "Diagnosis") -> str:
     """Small differences beside the causes, in words."""
-    return ", ".join(_describe_correction(item) for item in diagnosis.nuisance)
+    return ", ".join(describe_correction(item) for item in diagnosis.nuisance)
 
 
-def _describe_correction(item: "Nuisance") -> str:
-    """One small correction: times in seconds, shares in per cent."""
-    signal, _, kind = item.name.rpartition(".")
-    value = item.value
-    if kind in ("delay", "lag") and value.unit == "min":
-        seconds = replace(value, value=60.0 * abs(value.value), sd=60.0 * value.sd, unit="s")
-        amount = format_interval(seconds)
-        return (
-            f"{signal} lags by {amount}"
-            if kind == "lag"
-            else f"{signal} is stamped {amount} {'late' if value.value > 0.0 else 'early'}"
-        )
-    if value.unit == "1":
-        value = replace(value, value=100.0 * value.value, sd=100.0 * value.sd, unit="%")
+def describe_correction(item: "Nuisance") -> str:
+    """A small correction: times in seconds, shares in per cent."""
+    signal, kind, scale, unit = _correction(item)
+    value = replace(item.value, value=scale * item.value.value, sd=scale * item.value.sd, unit=unit)
+    amount = format_interval(replace(value, value=abs(value.value)))
+    if kind == "lag":
+        return f"{signal} lags by {amount}"
+    if kind == "delay":
+        return f"{signal} is stamped {amount} {'late' if value.value > 0.0 else 'early'}"
     return f"{item.name} {format_interval(value)}"
+
+
+def describe_prior(item: "Nuisance") -> str:
+    """What was expected of a small correction before the record: its 95 % range."""
+    if item.prior_sd is None:
+        return "not stated"
+    _, kind, scale, unit = _correction(item)
+    half = scale * replace(item.value, sd=item.prior_sd).half_width
+    return f"{'up to' if kind == 'lag' else '±'} {half:.2g} {unit}".rstrip()
+
+
+def _correction(item: "Nuisance") -> tuple[str, str, float, str]:
+    """Signal, kind (`delay`, `lag` or empty), and scale and unit in which a small correction is shown."""
+    signal, _, kind = item.name.rpartition(".")
+    if kind in ("delay", "lag") and item.value.unit == "min":
+        return signal, kind, 60.0, "s"
+    return item.name, "", *((100.0, "%") if item.value.unit == "1" else (1.0, item.value.unit))
 
 
 def describe_training(diagnosis: "Diagnosis") -> str:
@@ -272,6 +285,12 @@ def format_error(value: float, unit: str) -> str:
     return f"{value:.3g} {unit}" if isfinite(value) else "none, it ran away"
 
 
+def describe_remaining(item: "Remaining") -> str:
+    """Error of an output that is left, beside the noise."""
+    where = f", {describe_place(item.location)}" if item.location else ""
+    return f"{format_error(item.rmse, item.unit)}{where}; the noise alone is {item.noise_sd:.3g} {item.unit}"
+
+
 def describe_holdout(name: str, item: "HeldOut", *, improved: bool) -> str:
     """Error of the simulation on held-out rows, in one line."""
     before = f", before {format_error(item.rmse_before, item.unit)}" if improved else ""
@@ -294,7 +313,7 @@ def describe_difference(name: str, item: "Difference") -> str:
 
 
 def describe_weight(item: "Cause | Alternative") -> str:
-    """Share of the squared error that an explanation removes, and its probability if the cause is in the catalogue."""
+    """Share of the squared error that an explanation removes, and its probability."""
     return f"removes {percent(item.share)} of the squared error; {percent(item.probability)} likely"
 
 
@@ -344,7 +363,7 @@ def diagnosis_text(diagnosis: "Diagnosis", effects: Sequence[Effect]) -> str:
             _line("when", describe_timing(cause, diagnosis.curves)),
         ]
     if diagnosis.causes and isfinite(diagnosis.causes[0].share) and not ambiguous:
-        lines.append(_line("share", f"{describe_weight(diagnosis.causes[0])}, if the cause is in the catalogue"))
+        lines.append(_line("share", describe_weight(diagnosis.causes[0])))
     if diagnosis.nuisance and diagnosis.verdict != "nominal":
         lines.append(_line("corrections", f"{describe_nuisance(diagnosis)}  (95 %)"))
     if diagnosis.verdict == "unknown":

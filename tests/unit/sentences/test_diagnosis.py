@@ -135,7 +135,7 @@ def test_people_read_sizes_onsets_rivals_experiment_gain_and_remarks() -> None:
 def test_with_nuisance_people_read_shares_probabilities_and_corrections_instead_of_bic() -> None:
     text = diagnosis_text(CASES["inexact"], EFFECTS)
     for part in (
-        "share       removes 97 % of the squared error; 48 % likely, if the cause is in the catalogue",
+        "share       removes 97 % of the squared error; 48 % likely",
         "corrections T is stamped 2.00 ± 0.20 s early, C lags by 12 ± 2 s, volume 1.2 ± 0.4 %  (95 %)",
         "or          fouled jacket (heat_transfer, step): ",
         ", since 150.30 ± 0.20 min, which acts the same in this record",
