@@ -94,7 +94,7 @@ def describe_correction(item: "Nuisance") -> str:
 
 
 def describe_prior(item: "Nuisance") -> str:
-    """What was expected of a small correction before the record: its 95 % range."""
+    """Expected 95 % range of a small correction before the record."""
     if item.prior_sd is None:
         return "not stated"
     _, kind, scale, unit = _correction(item)
