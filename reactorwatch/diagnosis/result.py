@@ -134,7 +134,8 @@ class Nuisance(Result, frozen=True):
     """A small difference between plant and model beside the causes.
 
     Attributes:
-        name: an effect of the catalogue, or `<signal>.delay` (negative: stamped early) or `<signal>.lag`.
+        name: an effect of the catalogue, or `<signal>.lag` or `<signal>.delay` (negative: an output is measured
+            after its stamp, an input acts before it).
         value: estimate of it.
         prior_sd: standard deviation of its prior; None: it is a small correction that was found without one.
     """

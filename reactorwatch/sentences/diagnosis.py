@@ -1,7 +1,7 @@
 """A diagnosis in words: its verdict, causes, law and errors in sentences, and all of it as lines for a terminal."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from math import floor, isfinite, log10
 from typing import TYPE_CHECKING
 
@@ -78,18 +78,27 @@ def describe_verdict(diagnosis: "Diagnosis", *, are_listed: bool = False) -> str
 
 def describe_nuisance(diagnosis: "Diagnosis") -> str:
     """Small differences beside the causes, in words."""
-    return ", ".join(describe_correction(item) for item in diagnosis.nuisance)
+    return ", ".join(describe_correction(item, diagnosis.remaining) for item in diagnosis.nuisance)
 
 
-def describe_correction(item: "Nuisance") -> str:
-    """A small correction: times in seconds, shares in per cent."""
+def describe_correction(item: "Nuisance", outputs: Collection[str]) -> str:
+    """A small correction: times in seconds, shares in per cent.
+
+    Args:
+        item: the correction.
+        outputs: names of the outputs.
+    """
     signal, kind, scale, unit = _correction(item)
     value = replace(item.value, value=scale * item.value.value, sd=scale * item.value.sd, unit=unit)
     amount = format_interval(replace(value, value=abs(value.value)))
     if kind == "lag":
         return f"{signal} lags by {amount}"
-    if kind == "delay":
-        return f"{signal} is stamped {amount} {'late' if value.value > 0.0 else 'early'}"
+    if kind == "delay":  # an output shows what was a delay before its stamp, an input acts a delay after its own
+        is_output = signal in outputs
+        is_after = (value.value > 0.0) != is_output
+        return (
+            f"{signal} {'is measured' if is_output else 'acts'} {amount} {'after' if is_after else 'before'} its stamp"
+        )
     return f"{item.name} {format_interval(value)}"
 
 
@@ -365,7 +374,7 @@ def diagnosis_text(diagnosis: "Diagnosis", effects: Sequence[Effect]) -> str:
     if diagnosis.causes and isfinite(diagnosis.causes[0].share) and not ambiguous:
         lines.append(_line("share", describe_weight(diagnosis.causes[0])))
     if diagnosis.nuisance and diagnosis.verdict != "nominal":
-        lines.append(_line("corrections", f"{describe_nuisance(diagnosis)}  (95 %)"))
+        lines.append(_line("corrections", f"{describe_nuisance(diagnosis)}  (95 %), from the first row on"))
     if diagnosis.verdict == "unknown":
         lines += [
             _line(

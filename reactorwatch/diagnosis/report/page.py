@@ -91,7 +91,9 @@ def as_page(
         weight=describe_weight(diagnosis.causes[0]) if diagnosis.causes and isfinite(diagnosis.causes[0].share) else "",
         twins=[] if rivals else [item for item in diagnosis.alternatives if acts_alike(item)],
         remaining=[(name, describe_remaining(item)) for name, item in diagnosis.remaining.items()],
-        corrections=[(describe_correction(item), describe_prior(item)) for item in diagnosis.nuisance],
+        corrections=[
+            (describe_correction(item, diagnosis.remaining), describe_prior(item)) for item in diagnosis.nuisance
+        ],
         nearest=diagnosis.nearest if diagnosis.verdict == UNKNOWN else (),
         percent=percent,
         where=describe_place,

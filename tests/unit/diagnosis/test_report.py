@@ -121,7 +121,11 @@ def test_with_nuisance_the_page_leads_with_cause_share_and_what_is_left_and_spea
     top, _, below = page("inexact").partition("<h2>")
     parts = (
         *("<th>cause</th>", "removes 97 % of the squared error; 48 % likely", "it acts the same in this record"),
-        *("left in T</th><td>0.4 K; the noise alone is 0.303 K", "T is stamped 2.00 ± 0.20 s early", "± 12 s"),
+        *(
+            "left in T</th><td>0.4 K; the noise alone is 0.303 K",
+            "T is measured 2.00 ± 0.20 s after its stamp",
+            "± 12 s",
+        ),
         *("C lags by 12 ± 2 s", "up to 35 s", "volume 1.2 ± 0.4 %", "± 3.9 %"),
     )
     places = [top.index(part) for part in parts]

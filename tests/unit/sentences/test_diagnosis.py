@@ -7,11 +7,12 @@ import msgspec
 import pytest
 from msgspec.structs import replace
 
-from reactorwatch.diagnosis.result import Cause, Estimate
+from reactorwatch.diagnosis.result import Cause, Estimate, Nuisance
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.library.cascaded_tanks import EFFECTS as TANK_EFFECTS
 from reactorwatch.process.library.cstr import EFFECTS
 from reactorwatch.sentences.diagnosis import (
+    describe_correction,
     describe_size,
     describe_training,
     describe_verdict,
@@ -136,7 +137,8 @@ def test_with_nuisance_people_read_shares_probabilities_and_corrections_instead_
     text = diagnosis_text(CASES["inexact"], EFFECTS)
     for part in (
         "share       removes 97 % of the squared error; 48 % likely",
-        "corrections T is stamped 2.00 ± 0.20 s early, C lags by 12 ± 2 s, volume 1.2 ± 0.4 %  (95 %)",
+        "corrections T is measured 2.00 ± 0.20 s after its stamp, C lags by 12 ± 2 s, volume 1.2 ± 0.4 %  (95 %), "
+        "from the first row on",
         "or          fouled jacket (heat_transfer, step): ",
         ", since 150.30 ± 0.20 min, which acts the same in this record",
         "next        wrong feed temperature (feed_temperature, step), which removes 41 % of the squared error; "
@@ -146,9 +148,22 @@ def test_with_nuisance_people_read_shares_probabilities_and_corrections_instead_
     assert "BIC" not in text
     right = replace(CASES["inexact"], verdict="nominal", grade="right", causes=(), alternatives=())
     assert describe_verdict(right) == (
-        "The simulation is right but for small corrections: T is stamped 2.00 ± 0.20 s early, C lags by 12 ± 2 s, "
-        "volume 1.2 ± 0.4 %."
+        "The simulation is right but for small corrections: T is measured 2.00 ± 0.20 s after its stamp, "
+        "C lags by 12 ± 2 s, volume 1.2 ± 0.4 %."
     )
+
+
+@pytest.mark.parametrize(
+    ("name", "minutes", "expected"),
+    [
+        ("T.delay", -0.1, "T is measured 6 s after its stamp"),
+        ("T.delay", 0.1, "T is measured 6 s before its stamp"),
+        ("qc.delay", -0.1, "qc acts 6 s before its stamp"),
+        ("qc.delay", 0.1, "qc acts 6 s after its stamp"),
+    ],
+)
+def test_a_delay_is_described_by_when_a_signal_is_measured_or_acts(name: str, minutes: float, expected: str) -> None:
+    assert describe_correction(Nuisance(name, Estimate(minutes, 0.0, "min"), 0.1), ("C", "T")) == expected
 
 
 def test_an_unknown_lists_what_comes_nearest() -> None:
