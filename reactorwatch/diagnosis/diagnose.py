@@ -263,8 +263,10 @@ def diagnose(
     if explained is None:
         return exact
     answer = with_nuisance(exact, explained, model, effects, record, bands, uncertain)
+    if not answer.with_nuisance:
+        return answer
     about_record += describe_short_record(run, explained.nuisance.size)
-    return structs.replace(answer, remarks=tuple(dict.fromkeys([*about_record, *answer.remarks])))
+    return structs.replace(answer, remarks=tuple(about_record))
 
 
 def _causes_of(item: FittedHypothesis, run: Run, record: Record) -> tuple[Cause, ...]:
