@@ -263,10 +263,8 @@ def diagnose(
     if explained is None:
         return exact
     answer = with_nuisance(exact, explained, model, effects, record, bands, uncertain)
-    if not answer.with_nuisance:
-        return answer
     about_record += describe_short_record(run, explained.nuisance.size)
-    return structs.replace(answer, remarks=tuple(about_record))
+    return structs.replace(answer, remarks=tuple(about_record)) if answer.with_nuisance else answer
 
 
 def _causes_of(item: FittedHypothesis, run: Run, record: Record) -> tuple[Cause, ...]:

@@ -202,7 +202,7 @@ def test_causes_that_an_input_hides_that_never_moved_are_named(late_rows: int) -
     assert note.split(": ")[1] == "v.gain, v.lag, v.delay, v.stiction"
 
 
-def test_a_record_with_fewer_rows_than_nuisance_says_how_many_are_needed() -> None:
+def test_of_a_record_with_fewer_rows_than_nuisance_the_needed_rows_are_stated() -> None:
     run = make_run(tank_record(), tank())
     assert describe_short_record(run, run.time_min.size) == []
     (remark,) = describe_short_record(run, 700)
