@@ -46,7 +46,6 @@ from reactorwatch.kalman.noise_estimation import NoiseFit
 from reactorwatch.process import DEFAULT_PROCESS, effects_of, own_effects
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.extended_model import parse_extended_model, stored_model
-from reactorwatch.process.generic import needs_moves
 from reactorwatch.process.model import MODEL_CACHE_SIZE, ProcessModel
 from reactorwatch.process.profiles import FREE_NAME
 from reactorwatch.records.record import GAP_ROWS, MINUTE_NS, Record
@@ -276,22 +275,6 @@ def find_uncertain(model: ProcessModel, outputs: tuple[str, ...], rows: RowArray
     certain, uncertain = fitter.sds_after_moves(plain), fitter.sds_after_moves(best)
     # the training leaves open how the plant follows
     return Uncertain(constants) if np.any(uncertain > 1.25 * certain) else Uncertain()
-
-
-def describe_still_inputs(model: ProcessModel, inputs: Array) -> list[str]:
-    """Describe which causes cannot be seen, as inputs never moved in the training; empty if all did.
-
-    Args:
-        model: the process model.
-        inputs: inputs of the training, shape (rows, n_u).
-    """
-    columns = zip(model.input_names, inputs.T, strict=True)
-    held = {name: float(column[0]) for name, column in columns if np.ptp(column) == 0.0}  # NaN is not equal to itself
-    hidden = [effect.name for effect in effects_of(model) if held and needs_moves(model, effect, held)]
-    if not hidden:
-        return []
-    levels = " and ".join(f"{name} ({level:g})" for name, level in held.items())
-    return [f"training: {levels} never moved, so these causes cannot be seen until it does: {', '.join(hidden)}"]
 
 
 def describe_uncertain(uncertain: Sequence[str]) -> str:

@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 import typer
 
+from reactorwatch.progress import reporting_to
 from reactorwatch.terminal import printable, printable_lines
 
 WRONG, ATTENTION, RIGHT, CAUSE, FAINT, STRONG = "1;31", "33", "32", "36", "2", "1"
@@ -205,6 +206,13 @@ def bar(text: str, total: float | None) -> Iterator[Advance]:
         yield advance
 
 
-def task(text: str) -> contextlib.AbstractContextManager[Advance]:
-    """Show a spinner while the context lasts."""
-    return bar(text, None)
+@contextlib.contextmanager
+def task(text: str) -> Iterator[None]:
+    """Show a spinner while the context lasts, with the stages that are reported in it (`reactorwatch.progress`)."""
+
+    def show(stage: str, step: int, steps: int) -> None:
+        count = f" {step} of {steps}" if steps else f" {step}" if step else ""
+        advance(0, f"{text}: {stage}{count}")
+
+    with bar(text, None) as advance, reporting_to(show):
+        yield

@@ -35,6 +35,7 @@ import platformdirs
 
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.llvm_ir import CHAINED, IR_VERSION, PER_ROW, SHARED, RowLoop, check, write_ir
+from reactorwatch.progress import report_stage
 
 LANES = 4
 """Number of rows, or chains of rows, in one vector operation: four doubles are the 256 bits of AVX2."""
@@ -188,6 +189,7 @@ class _Host:
         self._triple = llvm.get_process_triple()
         self._cpu, self._features = llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten()
         self._cache = CodeCache(platformdirs.user_cache_path("reactorwatch") / "machine_code")
+        self._compiled = 0
 
     def load(self, function: ca.Function, loop: RowLoop) -> llvm.ExecutionEngine:
         """Engine with the machine code of a function, from the cache if it was compiled before."""
@@ -196,9 +198,13 @@ class _Host:
         name = hashlib.sha256(depends_on.encode()).hexdigest()
         target = llvm.Target.from_triple(self._triple)
         machine = target.create_target_machine(cpu=self._cpu, features=self._features, opt=0, jit=True)
-        stored = self._cache.get_or_make(
-            name, lambda: bytes(machine.emit_object(llvm.parse_assembly(write_ir(function, loop))))
-        )
+
+        def compile_now() -> bytes:
+            self._compiled += 1
+            report_stage("compiling function", self._compiled)
+            return bytes(machine.emit_object(llvm.parse_assembly(write_ir(function, loop))))
+
+        stored = self._cache.get_or_make(name, compile_now)
         engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), machine)
         engine.add_object_file(llvm.ObjectFileRef.from_data(stored))
         engine.finalize_object()

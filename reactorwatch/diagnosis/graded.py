@@ -243,8 +243,8 @@ def _answer_with_nuisance(
         experiment=None,
         extended_model=extended_model(adjusted, effects, causes, record.zero_ns),
         parameters=_parameters(best, explained, model, uncertain),
-        remarks=(),
         curves=curves,
+        with_nuisance=True,
     )
 
 

@@ -28,6 +28,7 @@ from reactorwatch.diagnosis.run import Run
 from reactorwatch.diagnosis.search.search import FittedHypothesis, Search, SearchResult
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.model import ProcessModel
+from reactorwatch.progress import track
 
 BETTER = 0.95
 """Ratio of held-out errors below which one explanation simulates better than another."""
@@ -93,7 +94,7 @@ def prefer_lasting(
         return None
     drifting = errors.simulation
     causes = _likely_causes(search, result)
-    fits = [fit_lasting(model, (effect,), uncertain, run) for effect in causes]
+    fits = [fit_lasting(model, (effect,), uncertain, run) for effect in track("fitting lasting cause", causes)]
     usable = [item for item in fits if item is not None]
     if not usable:
         return None

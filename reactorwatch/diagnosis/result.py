@@ -424,6 +424,7 @@ class Diagnosis(Result, frozen=True, kw_only=True):
         differences: differences between simulation and record, by output; in JSON only in a report.
         remarks: further remarks, in sentences.
         curves: curves for figures; with several runs, over `Record.continuous_min`.
+        with_nuisance: true if the explanations are those with nuisance: simulated, not filtered.
     """
 
     file: str
@@ -453,8 +454,9 @@ class Diagnosis(Result, frozen=True, kw_only=True):
     differences: dict[str, Difference]
     remarks: tuple[str, ...] = ()
     curves: Curves | None = None
+    with_nuisance: bool = False
 
-    python_only: ClassVar = ("differences", "remarks", "curves")
+    python_only: ClassVar = ("differences", "remarks", "curves", "with_nuisance")
 
     @property
     def is_extended(self) -> bool:

@@ -29,7 +29,7 @@ OPERATIONS: Mapping[str, Operation] = {
 }
 """Operation in a simulation, by name of a model."""
 
-LOCATION_PHRASES: Mapping[str, str] = cstr.LOCATIONS
+LOCATION_PHRASES: Mapping[str, str] = cstr.LOCATIONS | cascaded_tanks.LOCATIONS
 """Phrases of locations whose name is not enough, such as `on the side of the coolant`."""
 
 

@@ -245,7 +245,7 @@ def _of_parameter(model: ProcessModel, item: Parameter) -> Effect:
     return _make(
         ParameterShift if in_unit else ParameterEffect,
         f"{item.name}.deviation",
-        f"other {item.name} ({item.meaning})" if item.meaning else f"other {item.name}",
+        f"changed {item.name} ({item.meaning})" if item.meaning else f"changed {item.name}",
         f"{item.name} higher by {{}} {shown}",
         f"{item.name} lower by {{}} {shown}",
         location=parameter_location(model, item),

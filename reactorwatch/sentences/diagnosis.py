@@ -1,5 +1,6 @@
 """A diagnosis in words: its verdict, causes, law and errors in sentences, and all of it as lines for a terminal."""
 
+import re
 from collections.abc import Sequence
 from math import floor, isfinite, log10
 from typing import TYPE_CHECKING
@@ -15,6 +16,7 @@ if TYPE_CHECKING:
     from reactorwatch.diagnosis.difference import Difference
     from reactorwatch.diagnosis.result import (
         AdjustedParameter,
+        Alternative,
         Cause,
         Curves,
         Diagnosis,
@@ -22,6 +24,7 @@ if TYPE_CHECKING:
         HeldOut,
         Law,
         Nuisance,
+        Remaining,
     )
 
 INDENT = 14
@@ -42,6 +45,8 @@ def describe_verdict(diagnosis: "Diagnosis", *, are_listed: bool = False) -> str
         )
     if diagnosis.verdict == "nominal" and diagnosis.nuisance:
         return f"The simulation is right but for small corrections: {describe_nuisance(diagnosis)}."
+    if diagnosis.verdict == "nominal" and diagnosis.with_nuisance:
+        return "The simulation is right but for corrections that are too small to be listed one by one."
     if diagnosis.verdict == "nominal":
         return "The simulation is right: the rest of the record is noise."
     matters = describe_significance(diagnosis)
@@ -56,13 +61,16 @@ def describe_verdict(diagnosis: "Diagnosis", *, are_listed: bool = False) -> str
         return f"The simulation is wrong, and the record cannot tell why: {' or '.join(names)}. {matters}"
     if diagnosis.verdict == "named":
         causes = [f"{cause.label}, {describe_timing(cause, diagnosis.curves)}" for cause in diagnosis.causes]
+        twins = [item.label for other in diagnosis.alternatives if acts_alike(other) for item in other.explanation]
+        alike = f", or {' or '.join(twins)}, which acts the same in this record" if twins else ""
         mostly = ", mostly by" if diagnosis.grade == "mostly" else ":"
-        share = f" This removes {_percent(diagnosis.causes[0].share)} of the error." if mostly != ":" else ""
-        return f"The simulation is wrong{mostly} {'; and '.join(causes)}.{share} {matters}"
-    text = f"The simulation is wrong, and no known cause explains it; it acts {describe_location(diagnosis)}."
+        share = f" This removes {percent(diagnosis.causes[0].share)} of the squared error." if mostly != ":" else ""
+        return f"The simulation is wrong{mostly} {'; and '.join(causes)}{alike}.{share} {matters}"
+    where = f"it acts {describe_place(diagnosis.location)}" if diagnosis.location else "this record does not tell where"
+    text = f"The simulation is wrong, and no known cause explains it; {where}."
     if diagnosis.grade == "nearest":
         nearest = diagnosis.nearest[0]
-        text += f" Nearest is {nearest.label}, which removes {_percent(nearest.share)} of the error."
+        text += f" Nearest is {nearest.label}, which removes {percent(nearest.share)} of the squared error."
     if diagnosis.law is not None:
         text += f" A law explains it: {diagnosis.law.formula}, {diagnosis.law.term}."
     return f"{text} {matters}"
@@ -70,24 +78,36 @@ def describe_verdict(diagnosis: "Diagnosis", *, are_listed: bool = False) -> str
 
 def describe_nuisance(diagnosis: "Diagnosis") -> str:
     """Small differences beside the causes, in words."""
-    return ", ".join(_describe_correction(item) for item in diagnosis.nuisance)
+    return ", ".join(describe_correction(item) for item in diagnosis.nuisance)
 
 
-def _describe_correction(item: "Nuisance") -> str:
-    """One small correction: times in seconds, shares in per cent."""
-    signal, _, kind = item.name.rpartition(".")
-    value = item.value
-    if kind in ("delay", "lag") and value.unit == "min":
-        seconds = replace(value, value=60.0 * abs(value.value), sd=60.0 * value.sd, unit="s")
-        amount = format_interval(seconds)
-        return (
-            f"{signal} follows with {amount}"
-            if kind == "lag"
-            else (f"{signal} is {amount} {'late' if value.value > 0.0 else 'early'}")
-        )
-    if value.unit == "1":
-        value = replace(value, value=100.0 * value.value, sd=100.0 * value.sd, unit="%")
+def describe_correction(item: "Nuisance") -> str:
+    """A small correction: times in seconds, shares in per cent."""
+    signal, kind, scale, unit = _correction(item)
+    value = replace(item.value, value=scale * item.value.value, sd=scale * item.value.sd, unit=unit)
+    amount = format_interval(replace(value, value=abs(value.value)))
+    if kind == "lag":
+        return f"{signal} lags by {amount}"
+    if kind == "delay":
+        return f"{signal} is stamped {amount} {'late' if value.value > 0.0 else 'early'}"
     return f"{item.name} {format_interval(value)}"
+
+
+def describe_prior(item: "Nuisance") -> str:
+    """Expected 95 % range of a small correction before the record."""
+    if item.prior_sd is None:
+        return "not stated"
+    _, kind, scale, unit = _correction(item)
+    half = scale * replace(item.value, sd=item.prior_sd).half_width
+    return f"{'up to' if kind == 'lag' else '±'} {half:.2g} {unit}".rstrip()
+
+
+def _correction(item: "Nuisance") -> tuple[str, str, float, str]:
+    """Signal, kind (`delay`, `lag` or empty), and scale and unit in which a small correction is shown."""
+    signal, _, kind = item.name.rpartition(".")
+    if kind in ("delay", "lag") and item.value.unit == "min":
+        return signal, kind, 60.0, "s"
+    return item.name, "", *((100.0, "%") if item.value.unit == "1" else (1.0, item.value.unit))
 
 
 def describe_training(diagnosis: "Diagnosis") -> str:
@@ -95,8 +115,8 @@ def describe_training(diagnosis: "Diagnosis") -> str:
     if diagnosis.verdict == "nominal":
         return "the training agrees with the equations"
     if not diagnosis.causes:
-        where = diagnosis.location
-        return f"the training deviates from the equations ({where}), and no cause of the catalogue explains it"
+        where = f" {describe_place(diagnosis.location)}" if diagnosis.location else ""
+        return f"the training deviates from the equations{where}, and no cause of the catalogue explains it"
     text = f"the training deviates from the equations by {_join_sizes(diagnosis.causes)}"
     others = ", or ".join(_join_sizes(item.explanation) for item in diagnosis.alternatives)
     return f"{text}; its rows do not rule out {others}" if diagnosis.verdict == "ambiguous" else text
@@ -139,20 +159,16 @@ def describe_significance(diagnosis: "Diagnosis") -> str:
     return "It matters in practice." if diagnosis.practical else "In practice the difference is too small to matter."
 
 
-def describe_location(diagnosis: "Diagnosis") -> str:
-    """Location of the deviation."""
-    if not diagnosis.location:
-        return "where this record does not tell"
-    return describe_place(diagnosis.location)
-
-
 def describe_place(location: str) -> str:
-    """Phrase of a location.
+    """Phrase of a location; the names of a user's own process get no article.
 
-    >>> describe_place("upper_tank")
-    'in the upper tank'
+    >>> describe_place("upper_tank"), describe_place("tank3"), describe_place("T1")
+    ('in the upper tank', 'in tank 3', 'at T1')
     """
-    return LOCATION_PHRASES.get(location, f"in the {location.replace('_', ' ')}")
+    if location in LOCATION_PHRASES:
+        return LOCATION_PHRASES[location]
+    words = re.fullmatch(r"([a-z]{3,}(?:_[a-z]+)*)_?(\d*)", location)
+    return f"at {location}" if words is None else f"in {words[1].replace('_', ' ')} {words[2]}".rstrip()
 
 
 def describe_timing(cause: "Cause", curves: "Curves | None" = None) -> str:
@@ -269,6 +285,12 @@ def format_error(value: float, unit: str) -> str:
     return f"{value:.3g} {unit}" if isfinite(value) else "none, it ran away"
 
 
+def describe_remaining(item: "Remaining") -> str:
+    """Error of an output that is left, beside the noise."""
+    where = f", {describe_place(item.location)}" if item.location else ""
+    return f"{format_error(item.rmse, item.unit)}{where}; the noise alone is {item.noise_sd:.3g} {item.unit}"
+
+
 def describe_holdout(name: str, item: "HeldOut", *, improved: bool) -> str:
     """Error of the simulation on held-out rows, in one line."""
     before = f", before {format_error(item.rmse_before, item.unit)}" if improved else ""
@@ -279,7 +301,7 @@ def describe_difference(name: str, item: "Difference") -> str:
     """Error of the simulation, its share of noise, and the ranges where it is largest, in a sentence."""
     if not isfinite(item.rmse):
         return f"{name}: the simulation ran away from the record."
-    text = f"{name}: the simulation errs by {item.rmse:.3g} {item.unit}, {_percent(item.noise_share)} of it noise"
+    text = f"{name}: the simulation errs by {item.rmse:.3g} {item.unit}, {percent(item.noise_share)} of it noise"
     if item.noise_share > MOSTLY_NOISE:
         return f"{text}."
     places = [
@@ -290,20 +312,32 @@ def describe_difference(name: str, item: "Difference") -> str:
     return f"{text}; most {', '.join(places)}." if places else f"{text}; everywhere alike."
 
 
-def describe_odds(probability: float) -> str:
-    """A probability in per cent; no more than 99: what is not in the catalogue is not counted.
+def describe_weight(item: "Cause | Alternative") -> str:
+    """Share of the squared error that an explanation removes, and its probability."""
+    return f"removes {percent(item.share)} of the squared error; {percent(item.probability)} likely"
 
-    >>> describe_odds(0.9997)
-    'more than 99 % likely among the explanations'
-    >>> describe_odds(0.354)
-    '35 % likely among the explanations'
+
+def acts_alike(alternative: "Alternative") -> bool:
+    """True if an explanation has the same effect on the outputs as the best one, so that no record separates them."""
+    return alternative.delta_bic == 0.0
+
+
+def following(diagnosis: "Diagnosis") -> "Cause | None":
+    """The next best cause that is neither named nor listed as an alternative."""
+    listed = {item.cause for item in diagnosis.causes}
+    listed |= {item.cause for other in diagnosis.alternatives for item in other.explanation}
+    return next((item for item in diagnosis.nearest if item.cause not in listed), None)
+
+
+def percent(share: float) -> str:
+    """A share or a probability in per cent.
+
+    >>> percent(0.9997), percent(0.354)
+    ('more than 99 %', '35 %')
     """
-    share = "more than 99 %" if probability > 0.99 else f"{100.0 * probability:.2g} %"
-    return f"{'less than 1 %' if probability < 0.01 else share} likely among the explanations"
-
-
-def _percent(share: float) -> str:
-    return f"{100 * share:.0f} %" if share >= 0.01 else "less than 1 %"
+    if share < 0.01:
+        return "less than 1 %"
+    return "more than 99 %" if share > 0.99 else f"{100.0 * share:.0f} %"
 
 
 def _largest_min(cause: "Cause", curves: "Curves") -> float:
@@ -329,15 +363,15 @@ def diagnosis_text(diagnosis: "Diagnosis", effects: Sequence[Effect]) -> str:
             _line("when", describe_timing(cause, diagnosis.curves)),
         ]
     if diagnosis.causes and isfinite(diagnosis.causes[0].share) and not ambiguous:
-        first = diagnosis.causes[0]
-        lines.append(
-            _line("share", f"removes {_percent(first.share)} of the squared error; {describe_odds(first.probability)}")
-        )
+        lines.append(_line("share", describe_weight(diagnosis.causes[0])))
     if diagnosis.nuisance and diagnosis.verdict != "nominal":
-        lines.append(_line("beside", f"{describe_nuisance(diagnosis)}  (95 %)"))
+        lines.append(_line("corrections", f"{describe_nuisance(diagnosis)}  (95 %)"))
     if diagnosis.verdict == "unknown":
         lines += [
-            _line("nearest", f"{describe_explanation([item], effects)}; removes {_percent(item.share)} of the error")
+            _line(
+                "nearest",
+                f"{describe_explanation([item], effects)}; removes {percent(item.share)} of the squared error",
+            )
             for item in diagnosis.nearest
             if item.share >= 0.01
         ]
@@ -346,8 +380,9 @@ def diagnosis_text(diagnosis: "Diagnosis", effects: Sequence[Effect]) -> str:
         lines.append(_line("where", f"{', '.join(places)}: worse in BIC"))
     if diagnosis.law is not None:
         lines += [_line(name, text) for name, text in law_rows(diagnosis.law)]
-    if diagnosis.verdict != "nominal":
+    if diagnosis.is_extended and not diagnosis.with_nuisance:
         lines.append(_line("evidence", f"{diagnosis.gain.delta_bic:,.1f} in BIC over the simulation as it was"))
+    if diagnosis.verdict != "nominal":
         lines += [_line("differs", describe_difference(name, item)) for name, item in diagnosis.differences.items()]
     for name, known in diagnosis.parameters.items():
         lines.append(_line("parameter", f"{name} {describe_parameter(known)}  (95 %)"))
@@ -355,17 +390,24 @@ def diagnosis_text(diagnosis: "Diagnosis", effects: Sequence[Effect]) -> str:
         lines.append(_line("held out", describe_holdout(name, item, improved=diagnosis.is_extended)))
     if not ambiguous:
         lines += _alternatives(diagnosis, effects) + _experiment(diagnosis)
-    if diagnosis.causes and not diagnosis.alternatives and diagnosis.grade != "mostly":
-        lines.append(_line("or", "nothing else in the catalogue comes near"))
+    if diagnosis.causes and (after := following(diagnosis)) is not None:
+        lines.append(_line("next", f"{after.label} ({after.cause}, {after.profile}), which {describe_weight(after)}"))
     lines += [_line("note", remark) for remark in diagnosis.remarks]
     return printable_lines(lines)
 
 
 def _alternatives(diagnosis: "Diagnosis", effects: Sequence[Effect]) -> list[str]:
     return [
-        _line("or", f"{describe_explanation(item.explanation, effects)}, worse by {item.delta_bic:.1f} in BIC")
+        _line("or", f"{describe_explanation(item.explanation, effects)}, {describe_rival(item, diagnosis)}")
         for item in diagnosis.alternatives
     ]
+
+
+def describe_rival(item: "Alternative", diagnosis: "Diagnosis") -> str:
+    """Comparison of an alternative with the best explanation."""
+    if not diagnosis.with_nuisance:
+        return f"worse by {item.delta_bic:.1f} in BIC"
+    return "which acts the same in this record" if acts_alike(item) else f"which {describe_weight(item)}"
 
 
 def _experiment(diagnosis: "Diagnosis") -> list[str]:

@@ -108,7 +108,7 @@ def curves_with(item: Explanation, explained: Explained, curves: Curves) -> Curv
         else:
             course = fitted.simulated.deviation.sample_value[:, fitted.hypothesis.effect]
             deviation[item.effect.name] = course - fitted.theta[nuisance.effects][fitted.hypothesis.effect]
-    known = {name: np.full(len(after), item.size_sd) for name in deviation}
+    known = {name: item.size_sd * np.abs(m) / max(np.max(np.abs(m)), 1e-300) for name, m in deviation.items()}
     return replace(
         curves,
         simulated_after=dict(zip(names, after.T, strict=True)),

@@ -30,6 +30,7 @@ from reactorwatch.diagnosis.run import Run
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.signal_effects import InputDelay, InputLag, OutputDelay, OutputLag
+from reactorwatch.progress import report_stage, track
 
 ROUNDS = 2
 """Estimates of the discrepancy."""
@@ -158,7 +159,8 @@ class _Comparison:
             return None
         residual = self._fitter.residual(theta, simulated)
         noise = white(np.maximum(np.sqrt(np.mean(residual**2, axis=0)), self._smallest_sd))
-        for _ in range(ROUNDS):
+        for number in range(1, ROUNDS + 1):
+            report_stage("comparing with nuisance, round", number, ROUNDS + 1)
             fits = self._fit_best(self._rank(theta, simulated, noise), theta, noise, FIRST, slow_sensors=True)
             best = max(fits, key=lambda item: item.log_evidence, default=None)
             if best is None:
@@ -173,6 +175,7 @@ class _Comparison:
             if again is None:
                 return None
             simulated = again
+        report_stage("comparing with nuisance, round", ROUNDS + 1, ROUNDS + 1)
         fits = self._fit_best(self._rank(theta, simulated, noise), theta, noise, LAST)
         return self._explanations(fits, noise) if any(item.hypothesis.kind == NONE for item in fits) else None
 
@@ -212,7 +215,7 @@ class _Comparison:
         slow = theta.copy()
         slow[self._nuisance.output_lags] = self._nuisance.lag_start_min
         result = []
-        for item in (none, *chosen.values()):
+        for item in track("fitting with nuisance, hypothesis", (none, *chosen.values())):
             starts = [theta, slow] if slow_sensors and item.prior.lam == 1.0 else [theta]
             fits = [fit for start in starts if (fit := self._fitter.fit(item, start, noise)) is not None]
             result += [max(fits, key=lambda fit: fit.log_evidence)] if fits else []

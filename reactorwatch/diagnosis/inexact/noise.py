@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from math import log, sqrt
 
 import numpy as np
-from scipy.signal import lfilter
 
 from reactorwatch.arrays import Array
 
@@ -32,6 +31,8 @@ class Discrepancy:
 
     def whiten(self, values: Array) -> Array:
         """Whiten residuals or their derivatives, shape (rows, n_y, ...), in the standard deviation of e."""
+        from scipy.signal import lfilter  # only here and below: to import it is a third of a start
+
         result = np.empty_like(values)
         for j, (a, b, sd) in enumerate(zip(self.a, self.b, self.sd, strict=True)):
             result[:, j] = lfilter([1.0, -a], [1.0, -b], values[:, j], axis=0) / sd
@@ -45,6 +46,8 @@ def white(sd: Array) -> Discrepancy:
 
 def estimate_discrepancy(residual: Array, smallest_sd: Array) -> Discrepancy:
     """ARMA(1, 1) of residuals, shape (rows, n_y), 0 where not measured, by maximum likelihood over a grid."""
+    from scipy.signal import lfilter
+
     found = []
     for r, least in zip(residual.T, smallest_sd, strict=True):
         n = max(int(np.count_nonzero(r)), 1)

@@ -19,7 +19,6 @@ from itertools import pairwise
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import lfilter
 
 from reactorwatch.arrays import Array
 from reactorwatch.diagnosis.fitting.profiles import Signal
@@ -236,6 +235,8 @@ class InexactSimulation:
 
     def _lag_mean(self, held: Array, lag: float) -> Array:
         """Mean of a first-order lag's output over each interval, of an input that is held over each."""
+        from scipy.signal import lfilter  # only here and below: to import it is a third of a start
+
         h = self.run.period_min
         kept = float(np.exp(-h / lag))
         after = lfilter([1.0 - kept], [1.0, -kept], held, zi=[kept * held[0]])[0]
@@ -246,6 +247,8 @@ class InexactSimulation:
         """Readings of outputs, or of derivatives, each behind its delay and lag; shape as `y`, (rows, n_y, ...)."""
         if not (np.any(delays) or np.any(lags)):
             return y
+        from scipy.signal import lfilter
+
         result = y.copy()
         for j, (delay, lag) in enumerate(zip((delays / period_min).tolist(), lags.tolist(), strict=True)):
             if delay:

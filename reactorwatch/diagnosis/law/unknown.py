@@ -42,6 +42,7 @@ from reactorwatch.diagnosis.whiteness import DOUBTFUL, WHITE, minus_log10_p
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.law import ExtendedLaw, places_of
 from reactorwatch.process.model import Place, ProcessModel
+from reactorwatch.progress import report_stage, track
 
 FIRST_STEPS, STEPS = 2, 4
 """Gauss-Newton steps with the nominal filter's process noise, and without."""
@@ -175,7 +176,10 @@ def start_places(model: ProcessModel, run: Run, nominal: Fit, noise: Noise) -> S
     alone, apart = ([place for place in places if bool(place.apart) is flag] for flag in (False, True))
     nominals: dict[tuple[str, ...], FilterEvaluation] = {}
     answers = find_answers(model, run)
-    started = [_start(make_shape(model, place, scales, answers), run, wide, nominals) for place in alone]
+    started = [
+        _start(make_shape(model, place, scales, answers), run, wide, nominals)
+        for place in track("looking for an unknown, place", alone)
+    ]
     return StartedPlaces(_fit_all(started, free), apart, scales, answers, free, wide)
 
 
@@ -200,7 +204,7 @@ def fit_places(model: ProcessModel, run: Run, started: StartedPlaces) -> Unknown
 def find_laws(model: ProcessModel, run: Run, found: Unknown) -> Unknown:
     """Fit laws in the best places."""
     laws: list[FittedLaw] = []
-    for item in found.places[:NEAREST]:
+    for item in track("looking for a law, place", found.places[:NEAREST]):
         if item.bic < found.places[0].bic + NEAR:
             laws += _find_laws(model, item, run, found.noise)
     if not laws:
@@ -240,7 +244,7 @@ def _fit_all(started: Sequence[ShapeFit], free: Noise) -> list[ShapeFit]:
     """Fits without process noise of the most promising places, the best first."""
     started = sorted(started, key=_bic)
     near = [item for i, item in enumerate(started) if i < PROMISING or item.bic < started[0].bic + NEAR]
-    return sorted((_refit(item, free) for item in near), key=_bic)
+    return sorted((_refit(item, free) for item in track("fitting an unknown, place", near)), key=_bic)
 
 
 def _refit(item: ShapeFit, noise: Noise) -> ShapeFit:
@@ -375,6 +379,7 @@ class UnknownSearch:
             return Localised(Unknown(tuple(self._first_places.fits), (), self._first_places.free, np.inf), None)
         found, curve = self._evidence, None
         if np.isinf(explained_bic) and (found.log_p >= WHITE or _is_noisy(found, self._model)):
+            report_stage("looking for an unknown course in time")
             curve = locate(self._model, self._effects, self._run, self._nominal.fit, self._noise)
             if curve is not None:
                 count = np.count_nonzero(found.places[0].coefficients)

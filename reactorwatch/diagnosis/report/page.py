@@ -12,23 +12,29 @@ from reactorwatch import html
 from reactorwatch.diagnosis.difference import Difference
 from reactorwatch.diagnosis.report import mathml, panels
 from reactorwatch.diagnosis.report.equations import Equation, balances, meanings
-from reactorwatch.diagnosis.result import AMBIGUOUS, NOMINAL, Cause, Diagnosis, Experiment
+from reactorwatch.diagnosis.result import AMBIGUOUS, NOMINAL, UNKNOWN, Cause, Diagnosis, Experiment
 from reactorwatch.diagnosis.whiteness import WHITE
 from reactorwatch.process import DEFAULT_PROCESS
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.profiles import FREE_NAME, PROFILES
 from reactorwatch.sentences.diagnosis import (
+    acts_alike,
     describe_causes,
+    describe_correction,
     describe_difference,
-    describe_location,
     describe_parameter,
     describe_place,
+    describe_prior,
+    describe_remaining,
+    describe_rival,
     describe_size,
     describe_timing,
     describe_verdict,
+    describe_weight,
     format_interval,
     law_rows,
+    percent,
 )
 
 PRINTED = 80
@@ -71,15 +77,23 @@ def as_page(
     """
     catalogue = {effect.name: effect for effect in effects}
     causing = [catalogue[cause.cause] for cause in diagnosis.causes]
-    rivals: list[tuple[tuple[Cause, ...], float]] = []
+    rivals: list[tuple[tuple[Cause, ...], str]] = []
     if diagnosis.verdict == AMBIGUOUS:
-        rivals = [(diagnosis.causes, 0.0), *((item.explanation, item.delta_bic) for item in diagnosis.alternatives)]
+        best = describe_weight(diagnosis.causes[0]) if diagnosis.with_nuisance else "the best"
+        others = [(item.explanation, describe_rival(item, diagnosis)) for item in diagnosis.alternatives]
+        rivals = [(diagnosis.causes, best), *others]
     return _PAGES.get_template("page.html.j2").render(
         diagnosis=diagnosis,
         file=file,
         verdict=describe_verdict(diagnosis, are_listed=True),
-        place=describe_location(diagnosis) if diagnosis.verdict != NOMINAL else "",
+        place="" if diagnosis.verdict == NOMINAL else describe_place(diagnosis.location or "record"),
         alternatives=rivals,
+        weight=describe_weight(diagnosis.causes[0]) if diagnosis.causes and isfinite(diagnosis.causes[0].share) else "",
+        twins=[] if rivals else [item for item in diagnosis.alternatives if acts_alike(item)],
+        remaining=[(name, describe_remaining(item)) for name, item in diagnosis.remaining.items()],
+        corrections=[(describe_correction(item), describe_prior(item)) for item in diagnosis.nuisance],
+        nearest=diagnosis.nearest if diagnosis.verdict == UNKNOWN else (),
+        percent=percent,
         where=describe_place,
         when=describe_timing,
         size=lambda cause: describe_size(cause, effects),
@@ -97,6 +111,7 @@ def as_page(
         law=panels.law(diagnosis),
         law_rows=[] if diagnosis.law is None else law_rows(diagnosis.law),
         extended=diagnosis.is_extended,
+        is_compared=diagnosis.is_extended or diagnosis.with_nuisance,
         residuals=panels.residuals(diagnosis, model),
         differences=[(describe_difference(name, item), _strips(item)) for name, item in diagnosis.differences.items()],
         white=WHITE,
@@ -108,7 +123,6 @@ def as_page(
         commands=_commands(file, model_file, on_the_bus=on_the_bus),
         origin=origin,
         error=lambda value: f"{value:.3g}" if isfinite(value) else "ran away",
-        percent=lambda share: "over 99 %" if share > 0.99 else f"{100.0 * share:.0f} %",
     )
 
 
@@ -151,6 +165,9 @@ def _strips(item: Difference) -> list[tuple[str, list[tuple[str, str, int]]]]:
 
 
 def _evidence(diagnosis: Diagnosis, effects: Sequence[Effect]) -> list[tuple[str, str]]:
+    if diagnosis.with_nuisance:
+        causes = [(item, describe_causes([(item.cause, item.profile)], effects)) for item in diagnosis.nearest]
+        return [(text, f"{percent(item.share)} removed, {percent(item.probability)} likely") for item, text in causes]
     if not diagnosis.is_extended:
         return [("the simulation as it is", "0")]
     best = describe_causes([(cause.cause, cause.profile) for cause in diagnosis.causes], effects)

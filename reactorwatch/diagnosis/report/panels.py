@@ -36,10 +36,12 @@ def closer(diagnosis: Diagnosis, model: ProcessModel) -> list[Panel]:
 
 
 def residuals(diagnosis: Diagnosis, model: ProcessModel) -> list[Panel]:
-    """One-step-ahead residuals in standard deviations, without and with the cause."""
+    """Residuals in standard deviations: one-step-ahead without and with the cause, with nuisance of the simulation."""
     curves = _curves(diagnosis)
     kinds = [("simulation as it is", "after" if diagnosis.verdict == NOMINAL else "before", curves.residual_before)]
-    if diagnosis.is_extended:
+    if diagnosis.with_nuisance:  # errors of a simulation, which those of a filter without the cause are no match for
+        kinds = [("with the cause" if diagnosis.causes else "with small corrections", "after", curves.residual_after)]
+    elif diagnosis.is_extended:
         what = "the cause" if diagnosis.causes else "the law"
         kinds = [
             (f"without {what}", "before", curves.residual_before),
@@ -155,14 +157,15 @@ def _compare(diagnosis: Diagnosis, output: Output, rows: slice) -> Panel:
     """Measurements of an output, the simulation as it was, and the extended one."""
     curves, title = _curves(diagnosis), f"{output.name}, {output.unit}"
     times, name = curves.time_min[rows], output.name
-    nominal = diagnosis.verdict == NOMINAL
+    nominal = diagnosis.verdict == NOMINAL and not diagnosis.with_nuisance
     before = ("simulation", "after") if nominal else ("simulation as it was", "before")
     lines = [
         Line("measured", times, curves.measured[name][rows]),
         Line(before[0], times, curves.simulated_before[name][rows], before[1]),
     ]
-    if diagnosis.is_extended:
-        lines.append(Line("extended simulation", times, curves.simulated_after[name][rows], "after"))
+    if diagnosis.is_extended or diagnosis.with_nuisance:
+        after = "extended simulation" if diagnosis.is_extended else "with small corrections"
+        lines.append(Line(after, times, curves.simulated_after[name][rows], "after"))
     text = f"{title}: {', '.join(line.label for line in lines)}"
     return Panel(title, tuple(lines), _onsets(diagnosis.causes), text=text)
 

@@ -47,6 +47,7 @@ from reactorwatch.diagnosis.search.screen import (
 )
 from reactorwatch.kalman.error_dynamics import ErrorDynamics
 from reactorwatch.process.effect import Effect
+from reactorwatch.progress import track
 
 Evaluate: TypeAlias = Callable[[Effect, Sequence[Signal]], Sequence[FilterEvaluation]]
 """Function from deviations of an effect to the filter results with them."""
@@ -78,7 +79,7 @@ class DynamicEffectsScreen:
             least_score: predicted gains below this, in BIC, are not confirmed by a filter run.
         """
         result = []
-        for effect in self._effects if of is None else of:
+        for effect in track("screening dynamic cause", self._effects if of is None else of):
             starts = effect.start_values or (effect.typical,)
             results = evaluate(effect, [self._constant.signal(np.array([start])) for start in starts])
             gains = [2.0 * (baseline.loss - item.loss) for item in results]

@@ -30,6 +30,7 @@ from reactorwatch.diagnosis.search.screen import KNOTS, Candidate, Part
 from reactorwatch.diagnosis.search.search import IN_QUESTION, FittedHypothesis, Label, Search, SearchResult, keep_best
 from reactorwatch.diagnosis.whiteness import DOUBTFUL, minus_log10_p
 from reactorwatch.process.effect import Effect
+from reactorwatch.progress import track
 
 LEAST_PAIR_GAIN = 40.0
 """Threshold in BIC, of a pair over the best single cause."""
@@ -108,7 +109,7 @@ class _PairSearch:
         candidates = self._screen_pairs(self._result.best)
         for _ in range(ROUNDS):
             untried = self._skip_tried(candidates, best)
-            rough = sorted((self._fit(item.parts, ROUGH_STEPS) for item in untried), key=_bic)
+            rough = sorted((self._fit(item.parts, ROUGH_STEPS) for item in track("fitting pair", untried)), key=_bic)
             if not rough:
                 break
             if best is None:
@@ -116,7 +117,7 @@ class _PairSearch:
                 rough = sorted((self._fit(item.parts, ROUGH_STEPS) for item in rough[:AGAIN]), key=_bic)
             before, near = best, min(item.bic for item in (*rough, best) if item is not None)
             near += _NEAR * max(nominal.bic - near, 0.0)
-            refined = [self._refine(item) for item in rough[:REFINED] if item.bic <= near]
+            refined = [self._refine(item) for item in track("refining pair", rough[:REFINED]) if item.bic <= near]
             best = min((item for item in (best, *refined) if item is not None), key=_bic)
             if best is before:
                 break
@@ -149,7 +150,7 @@ class _PairSearch:
         others = [effect for effect in search.screen.dynamic_effects if can_be_together(effect, part.effect)]
         candidates += search.dynamic_screen.candidates(first.fit, partial(self._evaluate_with, [part]), others)
         candidates = self._select_simple([item for item in candidates if can_be_together(item.effect, part.effect)])
-        pairs = [self._fit([part, candidate], EXCHANGE_STEPS) for candidate in candidates]
+        pairs = [self._fit([part, candidate], EXCHANGE_STEPS) for candidate in track("fitting pair", candidates)]
         if not pairs:
             return None
         best = min(pairs, key=_bic)
@@ -206,7 +207,7 @@ class _PairSearch:
                 candidates = self._select_new(self._candidates(best, index), best)
                 candidates = [item for item in candidates if curves or not isinstance(item.profile, PiecewiseLinear)]
                 least = max((item.score(self._run.values) for item in candidates), default=0.0) - IN_QUESTION
-                for candidate in search.select(candidates, EXCHANGED, least):
+                for candidate in track("fitting pair", search.select(candidates, EXCHANGED, least)):
                     knots = best.hypothesis.profiles[index].n_linear
                     item = self._fit(_replace_part(best, index, candidate, knots), EXCHANGE_STEPS)
                     if isinstance(candidate.profile, PiecewiseLinear) and item.bic < best.bic + IN_QUESTION:
@@ -281,7 +282,7 @@ class _PairSearch:
         result = []
         parts = about.parts
         own = {part.effect.name: index for index, part in enumerate(parts)}
-        for effect in self._search.screen.dynamic_effects:
+        for effect in track("screening for pairs, dynamic cause", self._search.screen.dynamic_effects):
             starts = effect.start_values or (effect.typical,)
             beside, before = parts, about.fit.w
             if effect.name in own:

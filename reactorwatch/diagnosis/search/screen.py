@@ -42,6 +42,7 @@ from reactorwatch.diagnosis.run import Run
 from reactorwatch.kalman.error_dynamics import ErrorDynamics, ErrorLinearization
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.model import MODEL_CACHE_SIZE, ProcessModel
+from reactorwatch.progress import report_stage
 
 
 class ConstantVariant(Effect):
@@ -178,6 +179,7 @@ class Screen:
             of: causes to screen among `static_effects`, at all start values of their constants; None: all.
         """
         of = self.static_effects if of is None else of
+        report_stage(f"screening causes ({len(of)})")
         variants = (item for item in self._columns if isinstance(item, ConstantVariant) and item.effect in of)
         effects = (*of, *variants)
         with np.errstate(over="ignore", invalid="ignore"):  # the filter may have lost an unstable plant

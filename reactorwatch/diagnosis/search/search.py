@@ -29,6 +29,7 @@ from reactorwatch.diagnosis.search.screen import Candidate, Part, Screen, first_
 from reactorwatch.kalman.noise_estimation import resolution_sd
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.model import ProcessModel
+from reactorwatch.progress import report_stage, track
 
 FIRST_CANDIDATES, MOST_CANDIDATES, CANDIDATES, A_CAUSE = 3, 8, 10, 2
 """Candidates of the first screen that are fitted, and if none of them gains anything; of later screens; of one
@@ -168,9 +169,12 @@ class Search:
             for item in candidates
             if item.score(self.run.values) > (SCAN_SCORE if item.effect.is_discontinuous else FIRST_SCORE)
         ]
-        for number, candidate in enumerate(first_of_each(worth, lambda item: item.effect.name)):
-            if number >= (MOST_CANDIDATES if best is nominal else FIRST_CANDIDATES):
+        to_fit = first_of_each(worth, lambda item: item.effect.name)
+        for number, candidate in enumerate(to_fit):
+            most = MOST_CANDIDATES if best is nominal else FIRST_CANDIDATES
+            if number >= most:
                 break
+            report_stage("fitting cause", number + 1, min(most, len(to_fit)))
             item = self.fit_candidate(candidate)
             by_label[item.label] = item
             best = min(best, item, key=lambda item: item.bic)
@@ -213,7 +217,7 @@ class Search:
             least = max([LEAST_SCORE, *(self._least_score_beside(item) for item in candidates[:1])])
             extended = [*self._simpler_profiles(candidates, best), *dynamic_candidates]
             extended = [item for item in extended if (item.label,) not in dropped]
-            for candidate in [*self.select(candidates, CANDIDATES, least), *extended]:
+            for candidate in track("fitting cause", [*self.select(candidates, CANDIDATES, least), *extended]):
                 label: Label = (candidate.label,)
                 if label not in by_label or (label == best.label and self._is_distant(candidate, best)):
                     item = self.fit_candidate(candidate)
@@ -224,6 +228,7 @@ class Search:
 
     def _initial_noise(self) -> Noise:
         """Noise levels under which the nominal model is most likely. Its simulation shows the outliers."""
+        report_stage("estimating the noise")
         noise = self._without_process_noise((1.0,) * len(self._model.outputs))
         nominal = self._filters[()] = FaultFilter(self._model, (), noise)
         noise = nominal.estimate_noise(self.run, (), self._smallest_sd)

@@ -170,6 +170,14 @@ class LowerOutlet(Effect):
         return model.add_rate("x2", k3 * (root(level) - root(level, 0.5 + size)))
 
 
+LOCATIONS = {
+    "pump": "in the pump",
+    "upper_tank": "in the upper tank",
+    "lower_tank": "in the lower tank",
+    "level_sensor": "in the level sensor",
+}
+"""Phrases of the locations."""
+
 # fmt: off
 EFFECTS: tuple[Effect, ...] = (
     ParameterEffect("k4 (1 + m).", name="pump_gain",

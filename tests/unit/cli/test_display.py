@@ -1,10 +1,26 @@
 """Table rows: aligned, cut to a terminal, and plain elsewhere."""
 
+import os
+import pty
 import re
+import subprocess
+import sys
 
 import pytest
 
-from reactorwatch.cli.display import CAUSE, WRONG, Cell, Row, Screen, format_rows, print_report, print_rows, wrap_line
+from reactorwatch.cli.display import (
+    CAUSE,
+    WRONG,
+    Cell,
+    Row,
+    Screen,
+    format_rows,
+    print_report,
+    print_rows,
+    task,
+    wrap_line,
+)
+from reactorwatch.progress import report_stage
 
 ROWS: list[Row] = [
     (Cell("high", WRONG), "shewhart/T", "15 % of the coolant lost"),
@@ -81,3 +97,36 @@ def test_a_report_elsewhere_and_json_everywhere_stay_as_they_are(capsys: pytest.
     assert capsys.readouterr().out.split("\n")[:-1] == REPORT
     print_report('{"text": "' + "x" * 500 + '"}', as_json=True)
     assert capsys.readouterr().out == '{"text": "' + "x" * 500 + '"}\n'
+
+
+def test_the_stages_of_a_task_are_shown_nowhere_but_on_a_terminal(capfd: pytest.CaptureFixture[str]) -> None:
+    with task("diagnosing"):
+        report_stage("fitting cause", 1, 3)
+    assert capfd.readouterr() == ("", "")
+
+
+SHOWN = """
+import time
+from reactorwatch.cli.display import task
+from reactorwatch.progress import report_stage
+with task("diagnosing [a].csv"):
+    for stage in (("estimating the noise",), ("compiling function", 2), ("fitting cause", 1, 3)):
+        report_stage(*stage)
+        time.sleep(0.3)
+print("done")
+"""
+
+
+def test_on_a_terminal_the_stages_are_one_line_of_standard_error_that_is_erased_at_the_end() -> None:
+    ours, theirs = pty.openpty()
+    shown = subprocess.run([sys.executable, "-c", SHOWN], stdout=subprocess.PIPE, stderr=theirs, text=True, check=True)
+    os.close(theirs)
+    text = b""
+    while not text.endswith(b"\x1b[2K"):
+        text += os.read(ours, 4096)
+    os.close(ours)
+    assert shown.stdout == "done\n"
+    lines = text.decode()
+    for stage in ("estimating the noise", "compiling function 2", "fitting cause 1 of 3"):
+        assert f"diagnosing [a].csv: {stage} " in lines
+    assert lines.count("\n") == 1

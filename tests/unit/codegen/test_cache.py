@@ -4,7 +4,10 @@ from pathlib import Path
 
 import pytest
 
-from reactorwatch.codegen.compiled_function import CodeCache
+import reactorwatch as rw
+from reactorwatch.codegen.compiled_function import CodeCache, _host
+from reactorwatch.progress import reporting_to
+from tests.unit.diagnosis.linear_tank import tank_record
 
 
 class Maker:
@@ -57,3 +60,31 @@ def test_of_too_many_the_oldest_go(tmp_path: Path) -> None:
         store.get_or_make(f"{number:02}", make)
         (tmp_path / f"{number:02}").touch()
     assert sorted(item.name for item in tmp_path.iterdir()) == [f"{number:02}" for number in range(4, 11)]
+
+
+PROCESS = """
+import reactorwatch as rw
+from tests.unit.diagnosis.linear_tank import tank
+
+def process():
+    return rw.Process("tank", (rw.Signal("u", "m", "input"), rw.Signal("h", "m", "output")), tank())
+"""
+
+
+def test_a_process_of_ones_own_is_compiled_at_its_first_diagnosis_and_not_again_when_its_file_was_touched(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    file, record, compiled = tmp_path / "own.py", tank_record(gain=1.1), list[int]()
+    _host.cache_clear()
+    try:
+        for _ in range(2):
+            file.write_text(PROCESS)
+            stages: list[str] = []
+            with reporting_to(lambda stage, _step, _steps, stages=stages: stages.append(stage)):  # type: ignore[misc]
+                rw.diagnose(record, file)
+            compiled.append(stages.count("compiling function"))
+    finally:
+        _host.cache_clear()
+    assert compiled[0] > 0
+    assert compiled[1] == 0

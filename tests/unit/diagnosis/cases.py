@@ -24,6 +24,8 @@ from reactorwatch.diagnosis.result import (
     Law,
     LawCurve,
     LocationEvidence,
+    Nuisance,
+    Remaining,
     RivalLaw,
     Separation,
 )
@@ -208,6 +210,36 @@ CASES = {
         ),
     ),
 }
+TWIN = Cause(
+    cause="heat_transfer",
+    profile="step",
+    label="fouled jacket",
+    location="energy_balance",
+    parameters={"size": Estimate(-0.12, 0.004, "1"), "onset": Estimate(150.3, 0.1, "min")},
+)
+CASES["inexact"] = replace(
+    diagnosis_of("named", (replace(LEAK, share=0.97, probability=0.48),), (Alternative((TWIN,), 0.0, 0.97, 0.48),)),
+    grade="explained",
+    with_nuisance=True,
+    nearest=(
+        replace(LEAK, share=0.97, probability=0.48),
+        *(replace(cause, share=0.41, probability=1e-9) for cause in FEED.explanation),
+    ),
+    nuisance=(
+        Nuisance("T.delay", Estimate(-2.0 / 60.0, 0.1 / 60.0, "min"), 0.1),
+        Nuisance("C.lag", Estimate(0.2, 0.02, "min"), 0.3),
+        Nuisance("volume", Estimate(0.012, 0.002, "1"), 0.02),
+    ),
+    remaining={"C": Remaining(0.00202, 0.00197, "mol/l", None), "T": Remaining(0.4, 0.303, "K", None)},
+)
+"""Compared with nuisance: another cause acts the same."""
+
+CASES["nearest"] = replace(
+    diagnosis_of("unknown", location="energy_balance"),
+    grade="nearest",
+    nearest=CASES["inexact"].nearest[1:],
+    remaining={"T": Remaining(0.9, 0.303, "K", "energy_balance")},
+)
 ROUGHLY = {
     "K3": AdjustedParameter(700.0, 14.0, 711.2, 1.5, "l/min"),
     "Tf": AdjustedParameter(350.0, 0.5, 350.0, 0.1, "K"),

@@ -4,6 +4,7 @@ import json
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 
 import msgspec
@@ -23,10 +24,11 @@ from reactorwatch.process import effects_of
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.extended_model import parse_extended_model
 from reactorwatch.process.library.cstr import cstr
+from reactorwatch.progress import reporting_to
 from reactorwatch.records.record import Record, join_runs
 from reactorwatch.sentences.diagnosis import diagnosis_text
 from tests.tables import read_csv
-from tests.unit.diagnosis.linear_tank import Shift, tank, tank_record
+from tests.unit.diagnosis.linear_tank import PERIOD_MIN, Gain, Shift, tank, tank_record
 from tests.unit.diagnosis.runs import record_of
 from tests.unit.process.effect_named import effect_of
 
@@ -338,3 +340,32 @@ def test_a_diagnosis_is_a_limited_effort(faults: tuple[str, ...], effort: Effort
     assert len(found.causes) == len(faults)
     assert counted["runs"] <= effort.runs
     assert counted["linearisations"] <= effort.linearisations
+
+
+STAGES = (
+    "estimating the noise",
+    "screening causes (2)",
+    "looking for an unknown, place",
+    "fitting pair",
+    "comparing with nuisance, round",
+    "fitting with nuisance, hypothesis",
+)
+
+
+def test_a_diagnosis_reports_its_stages_in_order_with_counts(capfd: pytest.CaptureFixture[str]) -> None:
+    record = tank_record(noise_sd=0.02)
+    late = replace(record, columns=record.columns | {"h": np.interp(record.time_min - 2 * PERIOD_MIN, *_level(record))})
+    reported: list[tuple[str, int, int]] = []
+    with reporting_to(lambda *stage: reported.append(stage)):
+        diagnose(late, tank(), (Gain(), Shift()))
+    assert list(dict.fromkeys(stage for stage, _, _ in reported if stage in STAGES)) == list(STAGES)
+    for stage in STAGES[2:]:
+        counts = [(step, steps) for name, step, steps in reported if name == stage]
+        assert counts[0][0] == 1
+        assert all(step <= steps for step, steps in counts)
+        assert all(after in (before + 1, 1) for (before, _), (after, _) in pairwise(counts))
+    assert capfd.readouterr() == ("", "")
+
+
+def _level(record: Record) -> tuple[Array, Array]:
+    return record.time_min, record.columns["h"]

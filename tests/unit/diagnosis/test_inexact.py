@@ -199,6 +199,7 @@ def test_a_cause_is_named_in_a_record_that_is_not_quite_the_model(group: str, tm
     assert cause.share > 0.95
     assert found.nearest[0].cause == cause.cause
     assert found.onset == cause.parameters["onset"]
+    assert any(remark.startswith("read as") for remark in found.result.remarks)
 
 
 @pytest.mark.slow

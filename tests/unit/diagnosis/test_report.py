@@ -89,7 +89,7 @@ def test_what_stands_in_the_page_from_outside_is_escaped(case: str) -> None:
         (
             "ambiguous",
             [
-                *("The experiment that would decide", "Wider steps", "ran away", "3.2", "42.0", "over 99 %"),
+                *("The experiment that would decide", "Wider steps", "ran away", "3.2", "42.0", "more than 99 %"),
                 *("as predicted under each", "reactorwatch plant --scenario experiment.csv --duration 20"),
             ],
         ),
@@ -115,6 +115,32 @@ def test_an_ambiguous_verdict_shows_all_rivals_with_their_sizes_and_the_experime
     assert "<th>cause</th>" in page("named").partition("<h2>")[0]
     assert "which is not certain" in page("ambiguous")
     assert "which is not certain" not in page("named")
+
+
+def test_with_nuisance_the_page_leads_with_cause_share_and_what_is_left_and_speaks_of_no_filter() -> None:
+    top, _, below = page("inexact").partition("<h2>")
+    parts = (
+        *("<th>cause</th>", "removes 97 % of the squared error; 48 % likely", "it acts the same in this record"),
+        *("left in T</th><td>0.4 K; the noise alone is 0.303 K", "T is stamped 2.00 ± 0.20 s early", "± 12 s"),
+        *("C lags by 12 ± 2 s", "up to 35 s", "volume 1.2 ± 0.4 %", "± 3.9 %"),
+    )
+    places = [top.index(part) for part in parts]
+    assert places == sorted(places)
+    for part in ("One-step-ahead", "one-step-ahead", "(p = ", "BIC"):
+        assert part not in below
+        assert part in page("named")
+    assert "41 % removed, less than 1 % likely" in below
+
+
+def test_an_unknown_leads_with_the_nearest_causes() -> None:
+    top = page("nearest").partition("<h2>")[0]
+    for part in (
+        "nearest causes",
+        "feed warmer by 1.23 K (± 0.10 K)",
+        "41 %",
+        "left in T</th><td>0.9 K, in the energy",
+    ):
+        assert part in top
 
 
 def test_an_ambiguous_verdict_without_an_experiment_states_it() -> None:

@@ -5,12 +5,19 @@ import re
 
 import msgspec
 import pytest
+from msgspec.structs import replace
 
 from reactorwatch.diagnosis.result import Cause, Estimate
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.library.cascaded_tanks import EFFECTS as TANK_EFFECTS
 from reactorwatch.process.library.cstr import EFFECTS
-from reactorwatch.sentences.diagnosis import describe_size, describe_verdict, diagnosis_text, format_interval
+from reactorwatch.sentences.diagnosis import (
+    describe_size,
+    describe_training,
+    describe_verdict,
+    diagnosis_text,
+    format_interval,
+)
 from tests.unit.diagnosis.cases import ADJUSTED, CASES, ROWS
 
 
@@ -38,6 +45,16 @@ from tests.unit.diagnosis.cases import ADJUSTED, CASES, ROWS
             "unknown",
             "The simulation is wrong, and no known cause explains it; it acts in the energy balance. "
             "It matters in practice.",
+        ),
+        (
+            "inexact",
+            "The simulation is wrong: coolant leak, since 150.33 ± 0.02 min, or fouled jacket, which acts the same in "
+            "this record. It matters in practice.",
+        ),
+        (
+            "nearest",
+            "The simulation is wrong, and no known cause explains it; it acts in the energy balance. Nearest is wrong "
+            "feed temperature, which removes 41 % of the squared error. It matters in practice.",
         ),
     ],
 )
@@ -113,6 +130,38 @@ def test_people_read_sizes_onsets_rivals_experiment_gain_and_remarks() -> None:
     assert order == sorted(order)
     assert "size        4.996 % of the coolant lost (± 0.017 %)  (95 %)" in diagnosis_text(CASES["named"], EFFECTS)
     assert "note        The record runs under <control>." in diagnosis_text(CASES["pair"], EFFECTS)
+
+
+def test_with_nuisance_people_read_shares_probabilities_and_corrections_instead_of_bic() -> None:
+    text = diagnosis_text(CASES["inexact"], EFFECTS)
+    for part in (
+        "share       removes 97 % of the squared error; 48 % likely",
+        "corrections T is stamped 2.00 ± 0.20 s early, C lags by 12 ± 2 s, volume 1.2 ± 0.4 %  (95 %)",
+        "or          fouled jacket (heat_transfer, step): ",
+        ", since 150.30 ± 0.20 min, which acts the same in this record",
+        "next        wrong feed temperature (feed_temperature, step), which removes 41 % of the squared error; "
+        "less than 1 % likely",
+    ):
+        assert part in text
+    assert "BIC" not in text
+    right = replace(CASES["inexact"], verdict="nominal", grade="right", causes=(), alternatives=())
+    assert describe_verdict(right) == (
+        "The simulation is right but for small corrections: T is stamped 2.00 ± 0.20 s early, C lags by 12 ± 2 s, "
+        "volume 1.2 ± 0.4 %."
+    )
+
+
+def test_an_unknown_lists_what_comes_nearest() -> None:
+    text = diagnosis_text(CASES["nearest"], EFFECTS)
+    assert "nearest     wrong feed temperature (feed_temperature, step): feed warmer by 1.23 K" in text
+    assert "removes 41 % of the squared error" in text
+    assert "evidence" not in text  # nothing extends the simulation
+
+
+def test_a_training_names_the_place_of_what_it_cannot_explain() -> None:
+    assert describe_training(CASES["unknown"]) == (
+        "the training deviates from the equations in the energy balance, and no cause of the catalogue explains it"
+    )
 
 
 @pytest.mark.parametrize("case", CASES)
