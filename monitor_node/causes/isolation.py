@@ -91,18 +91,18 @@ def causes_of(model: ProcessModel) -> tuple[Effect, ...]:
     return tuple(effect for effect in traced if effect.extend(model).state_names == model.state_names)
 
 
-def rank_suspects(candidates: Sequence[Candidate], left: "Left") -> list[SuspectedCause]:
+def rank_suspects(candidates: Sequence[Candidate], misfit: "Misfit") -> list[SuspectedCause]:
     """Compute the probability of each cause, most likely first; its size and onset are those of its likeliest profile.
 
     Args:
         candidates: each cause with each profile, the best first; at least one.
-        left: what the first leaves unexplained.
+        misfit: what the first leaves unexplained.
     """
-    evidence = [log_evidence_of(item) / left.factor for item in candidates]
+    evidence = [log_evidence_of(item) / misfit.factor for item in candidates]
     top = max(*evidence, 0.0)
     weights = [exp(item - top) for item in evidence]
-    odds = sqrt(2.0 / pi) / INEXACT * exp(-0.5 * (left.share / INEXACT) ** 2)
-    explained = 1.0 - left.probability / (1.0 + odds)
+    odds = sqrt(2.0 / pi) / INEXACT * exp(-0.5 * (misfit.share / INEXACT) ** 2)
+    explained = 1.0 - misfit.probability / (1.0 + odds)
     total = (sum(weights) + exp(-top)) / explained if explained > 0.0 else inf
     unknown = max(1.0 - sum(weights) / total, 0.0)
     suspects = [SuspectedCause(UNKNOWN, unknown)]
@@ -196,7 +196,7 @@ class Isolation:
         candidates = [item for item in self.fitter.fit(window, *scans, self.budget) if isfinite(item.gain)]
         if not candidates:  # no measurement would show a cause, or every filter diverged
             return [SuspectedCause(UNKNOWN, 1.0)]
-        return rank_suspects(candidates, Left.by(candidates[0], window))
+        return rank_suspects(candidates, misfit_of(candidates[0], window))
 
 
 INEXACT = 0.2
@@ -264,7 +264,7 @@ class Fitter:
         if not abs(gained - predicted) < _HOLDS * predicted + 5.0:
             return self._follow(window, early, without_fault)
         fitted = best_first(segment.fit(item, first=True, steps=_LAST_STEPS) for item in best[:MOST])
-        if Left.by(fitted[0], window).log_evidence > 0.0:
+        if misfit_of(fitted[0], window).log_evidence > 0.0:
             fitted = drop_needless_ends(best_first(segment.fit_end(item) for item in fitted))
         if len(best) <= MOST:  # a later look at more rows, in which the fault may be large, resumes from here
             end_min = float(window.time_min[-1])
@@ -390,7 +390,7 @@ class _Segment:
         """Return true if the plant no longer follows a candidate after a time: more than noise is left."""
         later = self._run.time_min > since_min
         w = self.evaluate(candidate, candidate.parameters).w[later]
-        return left_by(np.nan_to_num(w), np.isfinite(self._run.measured[later])).log_evidence > 0.0
+        return misfit(np.nan_to_num(w), np.isfinite(self._run.measured[later])).log_evidence > 0.0
 
     def choose_end(self, candidate: Candidate) -> Candidate:
         """Let a ramp end elsewhere, with the same slope, if that explains the rows better as it is."""
@@ -428,8 +428,8 @@ def _no_fault(run: Run) -> tuple[Array]:
     return (np.array([0.0, run.time_min[-1], run.time_min[-1]]),)
 
 
-class Left(NamedTuple):
-    """What a cause leaves of a deviation.
+class Misfit(NamedTuple):
+    """Part of a deviation that a cause does not explain.
 
     Attributes:
         log_evidence: logarithm of the evidence that its innovations are larger than noise by a factor, over that of
@@ -447,14 +447,14 @@ class Left(NamedTuple):
         """Probability that they are larger than noise."""
         return 1.0 / (1.0 + exp(-self.log_evidence))
 
-    @classmethod
-    def by(cls, candidate: Candidate, window: Window) -> "Left":
-        """What a cause leaves of a deviation since its onset."""
-        return left_by(*candidate.residual(window), candidate.gain)
+
+def misfit_of(candidate: Candidate, window: Window) -> Misfit:
+    """Misfit of a cause since its onset."""
+    return misfit(*candidate.residual(window), candidate.gain)
 
 
-def left_by(w: Array, measured: NDArray[np.bool_], gain: float = 0.0) -> Left:
-    """What a cause with these innovations leaves.
+def misfit(w: Array, measured: NDArray[np.bool_], gain: float = 0.0) -> Misfit:
+    """Misfit of a cause with these innovations.
 
     The variance of each sensor's noise is fitted to the rows, within the error of the training.
 
@@ -480,4 +480,4 @@ def left_by(w: Array, measured: NDArray[np.bool_], gain: float = 0.0) -> Left:
     log_evidence = (best if best > -inf else 0.0) - log(len(SUMMED_ROWS))
     beyond = max(0.5 * float(np.sum(blocks[0][0] / variance) - np.sum(blocks[0][1])), 0.0)
     share = sqrt(beyond / (gain + beyond)) if gain > 0.0 else 1.0
-    return Left(log_evidence, factor if log_evidence > 0.0 else 1.0, share)
+    return Misfit(log_evidence, factor if log_evidence > 0.0 else 1.0, share)

@@ -20,7 +20,7 @@ from monitor_node.causes.isolation import (
     Fitter,
     Isolation,
     causes_of,
-    left_by,
+    misfit,
 )
 from monitor_node.causes.scan import Candidate, GlrScan, scan_candidates
 from monitor_node.causes.window import Row, Window, window_of
@@ -363,7 +363,7 @@ def noise(seed: int) -> Array:
 
 
 def evidence(w: Array) -> float:
-    return left_by(w, np.ones(w.shape, dtype=bool)).log_evidence
+    return misfit(w, np.ones(w.shape, dtype=bool)).log_evidence
 
 
 @pytest.mark.parametrize("scale", [0.94, 1.0, 1.06])
@@ -382,5 +382,5 @@ def test_noise_half_as_large_again_is_a_residual() -> None:
 
 def test_without_measurements_there_is_no_residual() -> None:
     w = np.zeros((ROWS, 2))
-    assert left_by(w, np.zeros(w.shape, dtype=bool)).log_evidence <= 0.0
-    assert left_by(w[:0], np.zeros((0, 2), dtype=bool)).log_evidence <= 0.0
+    assert misfit(w, np.zeros(w.shape, dtype=bool)).log_evidence <= 0.0
+    assert misfit(w[:0], np.zeros((0, 2), dtype=bool)).log_evidence <= 0.0
