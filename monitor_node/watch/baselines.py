@@ -359,7 +359,7 @@ class ModelUpdate:
             return None
         effects, config = own_effects(self._model), self._config
         causes, text = tuple(effect.name for effect in effects), equations_text(self._model)
-        return DiagnosisJob(self.rows, config.signals, text, config.process, causes, effects)
+        return DiagnosisJob(self.rows, config.signals, text, config.process, causes, config.uncertain, effects)
 
     @property
     def is_pending(self) -> bool:
