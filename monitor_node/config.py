@@ -1,7 +1,7 @@
 """The monitor's settings."""
 
 from collections.abc import Callable, Mapping
-from math import ceil
+from math import ceil, inf
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple, TypeAlias
 
@@ -114,6 +114,8 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
         bounds: lowest and highest value by signal, in the unit in which it is judged; other values are not measured
             values, and an input at a bound is saturated, which an alarm states.
         resolution: smallest step between two values by output; without it, it is learned.
+        uncertain: standard deviations of parameters of the equations, by name, in their units; the diagnosis of the
+            training adjusts them.
         units: unit by signal, as its process describes it: that of samples which name none, and, without equations,
             the unit in which a signal is judged.
         order: order of the ARX models.
@@ -161,6 +163,7 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
     labels: tuple[str, ...] = ()
     bounds: dict[str, tuple[float, float]] = msgspec.field(default_factory=dict)
     resolution: dict[str, float] = msgspec.field(default_factory=dict)
+    uncertain: dict[str, float] = msgspec.field(default_factory=dict)
     units: dict[str, str] = msgspec.field(default_factory=dict)
     order: Annotated[int, msgspec.Meta(ge=1, le=20)] = 3
     delay: Annotated[int, msgspec.Meta(ge=1, le=100)] = 1
@@ -241,6 +244,9 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
                 )
             if not lower < upper:
                 raise ValueError(f"bounds of {signal} must be a lower and a higher number, got {lower:g} and {upper:g}")
+        for parameter, sd in self.uncertain.items():
+            if not 0.0 < sd < inf:
+                raise ValueError(f"uncertain: the standard deviation of {parameter} must be positive, got {sd:g}")
         for signal, step in self.resolution.items():
             if signal not in self.outputs:
                 raise ValueError(f"resolution is by output, {self.outputs}, got {signal!r}")

@@ -83,6 +83,11 @@ def watch_process(config: MonitorConfig, process: Process, rows: int | None = No
     for key, watched in (("bounds", names), ("resolution", changed["outputs"])):
         values = described[key] | stated[key]
         changed[key] = {name: value for name, value in values.items() if name in watched}
+    known = () if process.model is None else tuple(item.name for item in process.model.parameters)
+    for parameter in config.uncertain:
+        if parameter not in known:
+            raise InputError(f"settings [monitor] uncertain: {describe_unknown('parameter', parameter, known)}")
+    changed["uncertain"] = process.uncertain | config.uncertain
     if process.model is None:
         changed["process"] = WITHOUT_EQUATIONS
     if process.watch != DEFAULT.watch:

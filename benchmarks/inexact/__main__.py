@@ -1,11 +1,12 @@
 """`make inexact`: diagnoses of records that are not quite their model, drawn apart from the product.
 
     python -m benchmarks.inexact two-heaters|foreign|reactor [--n N] [--sound N] [--seed S] [--only CLASS]
-                                                             [--out FILE.jsonl] [--files FOLDER]
+                                                             [--out FILE.jsonl] [--files FOLDER] [--live]
 
 Every record is written to a file, and diagnosed by `reactorwatch diagnose --json` with a process file, as by a user.
 `--out` keeps a line of JSON for each: a later run with this file diagnoses only what is missing in it. `--files` writes
-the records, their truth and the process files into a folder, and diagnoses nothing.
+the records, their truth and the process files into a folder, and diagnoses nothing. `--live` watches the records with a
+cause until `AFTER_MIN` after its onset by `reactorwatch backtest`, and scores the suspects of the last alarm.
 """
 
 import argparse
@@ -19,11 +20,14 @@ from typing import Any
 from benchmarks.harness.study import Pool
 from benchmarks.inexact import foreign, reactor, two_heaters
 from benchmarks.inexact.records import Drawn, write_files
-from benchmarks.inexact.scores import score, table
+from benchmarks.inexact.scores import SUSPECTS, score, score_suspects, table
 from benchmarks.outside.scores import run
 from reactorwatch.errors import InputError
 
 PLANTS = {"two-heaters": two_heaters.draw, "foreign": foreign.draw, "reactor": reactor.draw}
+
+AFTER_MIN = 30.0
+"""Time after the onset at which suspects are scored."""
 
 Job = tuple[str, int, int, bool]
 """Plant, seed, number, and whether the plant is sound."""
@@ -48,6 +52,26 @@ def diagnose_record(job: Job) -> dict[str, Any]:
     return {"truth": drawn.truth, "score": result, "cpu_s": round(_children_s() - before_s, 2)}
 
 
+def watch_record(job: Job) -> dict[str, Any]:
+    """Draw a record, watch it until some time after the onset by the command, and score its last suspects.
+
+    The first third of the whole record is the training, as without an option.
+    """
+    drawn = draw_record(job)
+    assert drawn.cause is not None
+    assert drawn.cause.onset_min is not None
+    rows = len(next(iter(drawn.columns.values())))
+    until = min(int((drawn.cause.onset_min + AFTER_MIN) / drawn.period_min) + 1, rows)
+    shorter = drawn._replace(columns={name: values[:until] for name, values in drawn.columns.items()})
+    with tempfile.TemporaryDirectory() as folder:
+        path, process = write_files(shorter, Path(folder))
+        before_s = _children_s()
+        found = run("backtest", str(path), "--process", process, "--training-rows", str(rows // 3), "--json")
+    alarms = json.loads(found)["alarms"]
+    result = score_suspects(drawn.truth, alarms[-1]["suspect"] if alarms else [])
+    return {"truth": drawn.truth, "score": result, "cpu_s": round(_children_s() - before_s, 2)}
+
+
 def _children_s() -> float:
     """CPU time of all child processes that ended, s."""
     usage = resource.getrusage(resource.RUSAGE_CHILDREN)
@@ -63,6 +87,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--only", help="one class, such as lag")
     parser.add_argument("--out", type=Path, metavar="FILE.jsonl", help="file that keeps each result")
+    parser.add_argument("--live", action="store_true", help="watch the records with a cause")
     parser.add_argument("--files", type=Path, metavar="FOLDER", help="write the records and diagnose nothing")
     options = parser.parse_args(arguments)
     numbers = [*((i, False) for i in range(options.n)), *((i, True) for i in range(options.sound))]
@@ -72,6 +97,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if options.files:
         for job in jobs:
             write_files(draw_record(job), options.files)
+    elif options.live:
+        jobs = [job for job in jobs if not job[-1]]
+        print(table(Pool(1, results=options.out).run("inexact, live", watch_record, jobs), SUSPECTS))
     else:
         print(table(Pool(1, results=options.out).run("inexact", diagnose_record, jobs)))
     return 0

@@ -6,6 +6,7 @@ An explanation is right if it names the true cause and nothing beside it. Explan
 - *First*: the first one is right. *Listed*: any one is.
 - *Leads*: the first cause of the first one is the true cause, whatever is named beside it.
 - *Size* and *onset*: those of the first right explanation are close to the truth; where none is right, both are wrong.
+- *Suspects* are scored by their order alone, `unknown` among them.
 - *Claimed*: the verdict names a cause and the difference matters in practice, or the grade says that causes explain it.
 """
 
@@ -21,6 +22,8 @@ COLUMNS = {"first": "first", "leads": "leads", "listed": "listed"} | {
     "onset": "onset within 2 rows",
     "claimed": "a cause claimed",
 }
+
+SUSPECTS = {"first": "first", "among_three": "among three", "unknown": "unknown first"}
 
 Json = Mapping[str, Any]
 
@@ -60,7 +63,20 @@ def score(truth: Json, found: Json) -> dict[str, Any]:
     return result
 
 
-def table(results: Sequence[Json]) -> str:
+def score_suspects(truth: Json, suspects: Sequence[Json]) -> dict[str, Any]:
+    """Score the suspects of an alarm, the likeliest first."""
+    named = [item["cause"] for item in suspects]
+    right = [name in truth["cause"]["names"] for name in named]
+    return {
+        "named": named,
+        "probabilities": [item["probability"] for item in suspects],
+        "first": any(right[:1]),
+        "among_three": any(right[:3]),
+        "unknown": named[:1] == ["unknown"],
+    }
+
+
+def table(results: Sequence[Json], columns: Mapping[str, str] = COLUMNS) -> str:
     """A row for each class of records with a cause, one for all of them, and one for the sound ones."""
     hidden = [item for item in results if item["truth"]["cause"] is not None]
     groups: dict[str, list[Json]] = {}
@@ -69,11 +85,11 @@ def table(results: Sequence[Json]) -> str:
     groups |= {"all with a cause": hidden, "sound": [item for item in results if item["truth"]["cause"] is None]}
     rows = []
     for name, members in groups.items():
-        shares = [_share([item["score"][key] for item in members if key in item["score"]]) for key in COLUMNS]
+        shares = [_share([item["score"][key] for item in members if key in item["score"]]) for key in columns]
         seconds = [item["cpu_s"] for item in members] or [0.0]
         errors = sum("error" in item["score"] for item in members)
         rows.append([name, str(len(members)), *shares, f"{np.median(seconds):.1f} / {max(seconds):.1f}", str(errors)])
-    return markdown(["records", "n", *COLUMNS.values(), "CPU s, median / most", "errors"], rows)
+    return markdown(["records", "n", *columns.values(), "CPU s, median / most", "errors"], rows)
 
 
 def _share(flags: Sequence[bool]) -> str:

@@ -14,7 +14,7 @@ them.
 A plant that equals the equations, and that the training has moved enough, needs neither.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from math import nan
@@ -46,7 +46,6 @@ from reactorwatch.kalman.noise_estimation import NoiseFit
 from reactorwatch.process import DEFAULT_PROCESS, effects_of, own_effects
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.extended_model import parse_extended_model, stored_model
-from reactorwatch.process.generic import needs_moves
 from reactorwatch.process.model import MODEL_CACHE_SIZE, ProcessModel
 from reactorwatch.process.profiles import FREE_NAME
 from reactorwatch.records.record import GAP_ROWS, MINUTE_NS, Record
@@ -84,6 +83,7 @@ class DiagnosisJob(NamedTuple):
         equations: the model as JSON (`ExtendedModel.to_object`), times in minutes since 1970-01-01 UTC.
         process: name or file of the process, as the monitor was given it.
         causes: names of effects of the process's own, which JSON cannot hold; None: those of the model's name.
+        uncertain: standard deviations of parameters of the model, by name.
         effects: these effects; None: they are loaded from the process. They may be a user's code, and are not pickled.
     """
 
@@ -92,6 +92,7 @@ class DiagnosisJob(NamedTuple):
     equations: str
     process: str | None = None
     causes: tuple[str, ...] | None = None
+    uncertain: Mapping[str, float] = {}  # never changed
     effects: tuple[Effect, ...] | None = None
 
     def __reduce__(self) -> tuple[type["DiagnosisJob"], tuple[Any, ...]]:
@@ -158,7 +159,7 @@ def diagnose_training(job: DiagnosisJob) -> Finding:
     outputs = job.signals[len(model.inputs) :]
     rows = RowArrays(time_min, columns[: len(model.inputs)].T, columns[len(model.inputs) :].T)
     uncertain = find_uncertain(model, outputs, rows)
-    verdict, why, extended = _diagnose(record, model, uncertain)
+    verdict, why, extended = _diagnose(record, model, uncertain, job.uncertain)
     if extended is not None:
         uncertain = find_uncertain(parse_extended_model(_json(extended)).build(), outputs, rows)
     if uncertain.names:
@@ -181,20 +182,30 @@ def _shorten_gaps(time_min: Array) -> Array:
     return np.asarray(time_min + np.append(np.cumsum(excess[::-1])[::-1], 0.0))
 
 
-def _diagnose(record: Record, model: ProcessModel, uncertain: Uncertain) -> tuple[str, str, dict[str, Any] | None]:
-    """Verdict of the diagnosis, the reason, and the model with the causes that last as JSON; None: there are none."""
+def _diagnose(
+    record: Record, model: ProcessModel, uncertain: Uncertain, sds: Mapping[str, float]
+) -> tuple[str, str, dict[str, Any] | None]:
+    """Verdict of the diagnosis, the reason, and the model with the causes that last as JSON; None: there are none.
+
+    Parameters with a standard deviation in `sds` have their adjusted values in it.
+    """
     from reactorwatch.diagnosis.diagnose import diagnose  # a quarter of a second, which no other row needs
 
     try:
-        found = diagnose(record, uncertain.add_disturbances(model))
+        found = diagnose(record, uncertain.add_disturbances(model), uncertain=sds)
     except InputError as error:
         if not uncertain.names:
             raise
         return FAILED, f"not diagnosed: {error}", None
     lasting = [cause for cause in found.causes if cause.profile != FREE_NAME]
-    if not lasting:
-        return found.verdict, describe_training(found), None
-    return found.verdict, describe_training(found), extended_model(model, effects_of(model), lasting, record.zero_ns)
+    moved = {name: item for name, item in found.parameters.items() if abs(item.value - item.nominal) > 2.0 * item.sd}
+    why = "; ".join(
+        [describe_training(found), *(f"{name} is {item.value:.4g} {item.unit}" for name, item in moved.items())]
+    )
+    if not (lasting or moved):
+        return found.verdict, why, None
+    adjusted = model.with_values({name: item.value for name, item in moved.items()})
+    return found.verdict, why, extended_model(adjusted, effects_of(model), lasting, record.zero_ns)
 
 
 @lru_cache(maxsize=MODEL_CACHE_SIZE)
@@ -264,22 +275,6 @@ def find_uncertain(model: ProcessModel, outputs: tuple[str, ...], rows: RowArray
     certain, uncertain = fitter.sds_after_moves(plain), fitter.sds_after_moves(best)
     # the training leaves open how the plant follows
     return Uncertain(constants) if np.any(uncertain > 1.25 * certain) else Uncertain()
-
-
-def describe_still_inputs(model: ProcessModel, inputs: Array) -> list[str]:
-    """Describe which causes cannot be seen, as inputs never moved in the training; empty if all did.
-
-    Args:
-        model: the process model.
-        inputs: inputs of the training, shape (rows, n_u).
-    """
-    columns = zip(model.input_names, inputs.T, strict=True)
-    held = {name: float(column[0]) for name, column in columns if np.ptp(column) == 0.0}  # NaN is not equal to itself
-    hidden = [effect.name for effect in effects_of(model) if held and needs_moves(model, effect, held)]
-    if not hidden:
-        return []
-    levels = " and ".join(f"{name} ({level:g})" for name, level in held.items())
-    return [f"training: {levels} never moved, so these causes cannot be seen until it does: {', '.join(hidden)}"]
 
 
 def describe_uncertain(uncertain: Sequence[str]) -> str:

@@ -24,7 +24,6 @@ from monitor_node.learn.training_diagnosis import (
     FAILED,
     DiagnosisJob,
     Finding,
-    describe_still_inputs,
     equations_text,
     read_equations,
 )
@@ -33,9 +32,10 @@ from monitor_node.watch.evaluation import Evaluation, EvaluationMemory
 from monitor_node.watch.operation import Operation
 from reactorwatch.contract.codec import check_signature
 from reactorwatch.contract.messages_pb2 import Baseline, BaselineCommand
+from reactorwatch.diagnosis.record_checks import describe_still_inputs
 from reactorwatch.diagnosis.result import NOMINAL
 from reactorwatch.errors import InputError
-from reactorwatch.process import own_effects
+from reactorwatch.process import effects_of, own_effects
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.stored_state import Memory, copy_of
 
@@ -134,7 +134,8 @@ class Baselines:
         self.modes.is_learned, self.modes.reference = True, trained.reference.kind
         self._evaluation.start(trained, period_ns, again=False)
         if self._model is not None and trained.reference.follows_equations:
-            self._evaluation.notes += describe_still_inputs(self._model, trained.rows.arrays.inputs)
+            still = describe_still_inputs(self._model, effects_of(self._model), trained.rows.arrays.inputs)
+            self._evaluation.notes += [f"training: {item}" for item in still]
         self._operation.end_training()
 
     def _check_training(self, trained: TrainingResult, period_ns: float, units: Sequence[str]) -> None:
@@ -358,7 +359,7 @@ class ModelUpdate:
             return None
         effects, config = own_effects(self._model), self._config
         causes, text = tuple(effect.name for effect in effects), equations_text(self._model)
-        return DiagnosisJob(self.rows, config.signals, text, config.process, causes, effects)
+        return DiagnosisJob(self.rows, config.signals, text, config.process, causes, config.uncertain, effects)
 
     @property
     def is_pending(self) -> bool:

@@ -126,7 +126,7 @@ def _open(file: Path, asked: BacktestOptions, *, learns: bool) -> _Opened:
     source = source._replace(messages=messages)
     if choice.is_default:
         recorded = source.process if source.measured is None else None
-        if recorded is None or recorded.name == DEFAULT.name:
+        if recorded is None:
             return _Opened(source, load_process(limit_training(settings, rows)), None, {})
         return _Opened(source, watch_process(settings, recorded, rows), recorded, {})
     process = choice.load(source.zero_ns or 0, on_bus=True)

@@ -53,7 +53,7 @@ from reactorwatch.diagnosis.practical_significance import (
     residual_exceeds_tolerance,
     tolerances_of,
 )
-from reactorwatch.diagnosis.record_checks import make_run
+from reactorwatch.diagnosis.record_checks import describe_short_record, describe_still_inputs, make_run
 from reactorwatch.diagnosis.result import (
     AMBIGUOUS,
     LISTED,
@@ -103,22 +103,23 @@ def diagnose(
         tolerance: root mean square difference that does not matter in practice, by output, in its unit; by default a
             fiftieth of the output's range.
         uncertain: standard deviations of uncertain parameters of the model, by name, in their units; the others are
-            exact.
-            See `reactorwatch.diagnosis.parameter_priors`.
+            exact, and those of 0 also in the comparison with nuisance. See `reactorwatch.diagnosis.parameter_priors`.
         limits: lowest and highest value allowed in an experiment, by input and output; by default somewhat
             wider than the record.
 
     Raises:
         InputError: the record cannot be diagnosed; a tolerance is of no output or not positive; an uncertain parameter
-            does not exist or its standard deviation is not positive; or limits are of no signal, not increasing or
-            beyond an input's bounds.
+            does not exist or its standard deviation is negative or larger than its value; or limits are of no signal,
+            not increasing or beyond an input's bounds.
     """
     _keep_memory()
     effects = effects_of(model) if effects is None else effects
     check_limits(model, limits or {})
     whole = make_run(record, model)
     bands = tolerances_of(whole, model, tolerance or {})
-    plant = add_priors(model, uncertain or {})
+    stated = uncertain or {}
+    plant = add_priors(model, stated)
+    uncertain = {name: sd for name, sd in stated.items() if sd > 0.0}
     hidden = hidden_sources(model, tuple(effects))
     smallest_sd = smallest_noise(model, whole.measured)
     search = Search(plant, (*effects, *hidden), whole, smallest_sd)
@@ -137,6 +138,7 @@ def diagnose(
     verdict = decide_without_nuisance(found, None)
     location = best.hypothesis.filter.effects[0].location if best.label else ""
     about_record = [*_describe_record(record), *_describe_outliers(whole, run)]
+    about_record += describe_still_inputs(model, effects, run.inputs)
     remarks = [*about_record]
     unknown: Localised | None = None
     if verdict == UNKNOWN or not found.is_white or (best.label and _may_be_unknown(result, best, model)):
@@ -157,8 +159,8 @@ def diagnose(
                 "the residual is small, but not white: the course in time may be rougher than the fitted profile"
             )
     lasting: LastingResult | None = None
-    if verdict in (NAMED, AMBIGUOUS) and _may_last(result, best, model, uncertain or {}):
-        lasting = prefer_lasting(search, result, best, model, uncertain or {})
+    if verdict in (NAMED, AMBIGUOUS) and _may_last(result, best, model, uncertain):
+        lasting = prefer_lasting(search, result, best, model, uncertain)
         if lasting is not None:
             result, best, unknown = lasting.result, lasting.result.hypotheses[0], None
             verdict = AMBIGUOUS if len(result.hypotheses) > 1 else NAMED
@@ -170,7 +172,7 @@ def diagnose(
     if law is None:
         best, covariances = refine_parameters(search, best)
     else:
-        reported, best = law_hypothesis(law, run, model, uncertain or {})
+        reported, best = law_hypothesis(law, run, model, uncertain)
         if unknown is not None and unknown.approximation > LISTED:
             remarks.append(
                 f"the law is an approximation: a smooth correction there is better by {unknown.approximation:.0f} BIC"
@@ -192,7 +194,7 @@ def diagnose(
         curves = replace(curves, unknown=unknown.curve.curve)
     blind = ~np.all(np.isfinite(result.nominal.fit.innovations.prediction), axis=1)
     causes = convert_to_run_minutes(hypothesis_causes(best, covariances), record) if law is None else ()
-    parameters = adjusted_parameters(run, model, uncertain or {}, best, None if lasting is None else lasting.sds)
+    parameters = adjusted_parameters(run, model, uncertain, best, None if lasting is None else lasting.sds)
     adjusted = model.with_values({name: item.estimate.value for name, item in parameters.items()})
     alternatives, nearest = _alternatives(result, best), nearest_of(result, best if law is None else result.nominal)
     listed, tolerated = list(dict.fromkeys([*nearest, *alternatives])), np.array([bands[i] for i in model.output_names])
@@ -257,10 +259,11 @@ def diagnose(
     )
     if not _calls_for_nuisance(exact, result, best, model, run):
         return exact
-    explained = explain(model, effects, run, _starts(run, result.nominal, model), uncertain or {}, smallest_sd)
+    explained = explain(model, effects, run, _starts(run, result.nominal, model), stated, smallest_sd)
     if explained is None:
         return exact
-    answer = with_nuisance(exact, explained, model, effects, record, bands, uncertain or {})
+    answer = with_nuisance(exact, explained, model, effects, record, bands, uncertain)
+    about_record += describe_short_record(run, explained.nuisance.size)
     return structs.replace(answer, remarks=tuple(about_record)) if answer.with_nuisance else answer
 
 

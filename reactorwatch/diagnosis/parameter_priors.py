@@ -31,10 +31,11 @@ def parse_priors(text: str, model: ProcessModel) -> dict[str, float]:
 
     Args:
         text: for each parameter a percentage of its value, or a number with its unit; of degC and degF only a number.
+            0 is exact, and needs no unit.
         model: process model with the parameters.
 
     Raises:
-        InputError: the text has another form, or there is no such parameter.
+        InputError: the text has another form, there is no such parameter, or its value is smaller.
     """
     result = {}
     for part in text.split(","):
@@ -44,7 +45,7 @@ def parse_priors(text: str, model: ProcessModel) -> dict[str, float]:
             raise InputError(f"uncertain must be parameter=tolerance, such as K3=2%,Tf=0.5K, got {part.strip()!r}")
         item = _find_parameter(name, model)
         unit = (match[2] or "").strip()
-        if unit not in ("%", item.unit):
+        if unit not in ("%", item.unit) and value != "0":
             raise InputError(f"uncertain {name} must be in % or in {item.unit}, got {value!r}")
         if unit == "%" and absolute(item.value, item.unit) is not None:
             raise InputError(f"uncertain {name} must be in {item.unit}, of which a share is no size, got {value!r}")
@@ -53,7 +54,7 @@ def parse_priors(text: str, model: ProcessModel) -> dict[str, float]:
         except ValueError:
             raise InputError(f"uncertain {name} must be a number with % or {item.unit}, got {value!r}") from None
         result[name] = 0.01 * amount * abs(item.value) if unit == "%" else amount
-        _check_sd(name, result[name], item.unit)
+        _check_sd(item, result[name])
     return result
 
 
@@ -62,14 +63,16 @@ def add_priors(model: ProcessModel, sds: Mapping[str, float]) -> ProcessModel:
 
     Args:
         model: process model of the plant.
-        sds: standard deviation of each parameter, in its unit.
+        sds: standard deviation of each parameter, in its unit; 0: it is exact, and has no offset.
 
     Raises:
-        InputError: there is no such parameter, or its standard deviation is not positive.
+        InputError: there is no such parameter, or its standard deviation is negative or larger than its value.
     """
     for name, sd in sds.items():
         item = _find_parameter(name, model)
-        _check_sd(name, sd, item.unit)
+        _check_sd(item, sd)
+        if not sd:
+            continue
         bounds = (item.lower - item.value, item.upper - item.value)
         off = variable(f"{name}{_OFF}", item.unit, bounds, sd, f"offset of {name}")
         begin = parameter(f"{name}{_BEGIN}", 0.0, item.unit, bounds, f"initial offset of {name}")
@@ -106,6 +109,12 @@ def _find_parameter(name: str, model: ProcessModel) -> Parameter:
     return model.parameter(name)
 
 
-def _check_sd(name: str, sd: float, unit: str) -> None:
-    if not (isfinite(sd) and sd > 0.0):
-        raise InputError(f"uncertain {name} must be a positive number of {unit}, got {sd:g}")
+def _check_sd(item: Parameter, sd: float) -> None:
+    name, value, unit = item.name, abs(item.value), item.unit
+    if not (isfinite(sd) and sd >= 0.0):
+        raise InputError(f"uncertain {name} must be a number of {unit} that is not negative, got {sd:g}")
+    if sd > value > 0.0 and absolute(value, unit) is None:
+        raise InputError(
+            f"uncertain {name} must be at most its value, {value:g} {unit}, got {sd:g}; "
+            "state its standard deviation, or correct its value"
+        )

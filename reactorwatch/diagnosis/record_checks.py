@@ -16,7 +16,7 @@ steady state there. A row is a tenth of the time constant with which that state 
 its own speed.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -26,7 +26,8 @@ from numpy.typing import NDArray
 from reactorwatch.arrays import Array
 from reactorwatch.diagnosis.run import Run
 from reactorwatch.errors import InputError, UnfitRecordError
-from reactorwatch.process.generic import output_scales, reference_point
+from reactorwatch.process.effect import Effect
+from reactorwatch.process.generic import needs_moves, output_scales, reference_point
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.simulate import Simulator
 from reactorwatch.process.steady_state import SteadyState, SteadyStates, steady_states
@@ -247,9 +248,15 @@ def make_run(record: Record, model: ProcessModel) -> Run:
     Missing inputs keep their last value. Times of a record with several runs are `continuous_min`.
 
     Raises:
-        InputError: too few rows; a signal that is missing, constant or in another unit; an impossible value.
+        InputError: a process without inputs; too few rows; a signal that is missing, constant or in another unit; an
+            impossible value.
     """
     name = record.name
+    if not model.inputs:
+        raise InputError(
+            f"{name}: a diagnosis needs a process with an input, {model.name} has none; causes are distinguished by "
+            "what outputs do when inputs move: make what moves the process an input of its equations"
+        )
     if record.rows < FEWEST_ROWS:
         raise UnfitRecordError(
             f"{name}: a diagnosis needs at least {FEWEST_ROWS} rows, got {record.rows}; record for longer"
@@ -300,6 +307,34 @@ def make_run(record: Record, model: ProcessModel) -> Run:
     time_min, starts = record.continuous_min, record.run_starts[1:]
     breaks, few = _breaks(time_min, u, there)
     return Run(time_min, u, np.column_stack(outputs), tuple(sorted({*breaks, *starts})), few, starts)
+
+
+def describe_still_inputs(model: ProcessModel, effects: Sequence[Effect], inputs: Array) -> list[str]:
+    """Describe which causes cannot be seen, as inputs never moved; empty if all did.
+
+    Args:
+        model: the process model.
+        effects: the causes.
+        inputs: inputs of the record, shape (rows, n_u).
+    """
+    columns = zip(model.input_names, inputs.T, strict=True)
+    held = {name: float(column[0]) for name, column in columns if np.ptp(column) == 0.0}  # NaN is not equal to itself
+    hidden = [effect.name for effect in effects if held and needs_moves(model, effect, held)]
+    if not hidden:
+        return []
+    levels = " and ".join(f"{name} ({level:g})" for name, level in held.items())
+    return [f"{levels} never moved, so these causes cannot be seen until it does: {', '.join(hidden)}"]
+
+
+def describe_short_record(run: Run, nuisance: int) -> list[str]:
+    """Describe that a record has fewer rows than the comparison with nuisance has parameters; empty if it has not."""
+    rows = run.time_min.size
+    if rows >= nuisance:
+        return []
+    return [
+        f"{rows} rows are few for the {nuisance} parameters of the nuisance, which its priors then decide: "
+        f"record at least {nuisance} rows"
+    ]
 
 
 def _breaks(

@@ -17,6 +17,7 @@ from reactorwatch.kalman.batch import FilterRecord
 from reactorwatch.kalman.ekf import Filter
 from reactorwatch.process.extended_model import parse_extended_model
 from reactorwatch.process.library.cstr import cstr
+from tests.unit.diagnosis.linear_tank import Gain, Shift, tank, tank_record
 from tests.unit.diagnosis.runs import make_run, record_of
 
 SENSORS = Noise((0.002, 0.3), (0.0, 0.0))
@@ -96,6 +97,7 @@ def test_the_uncertain_parameter_itself_is_a_cause_only_if_it_is_far_from_what_w
 
 def test_no_parameter_costs_the_filter_a_state_unless_it_is_uncertain() -> None:
     assert add_priors(cstr(), {}) is cstr()
+    assert add_priors(cstr(), {"K3": 0.0}) is cstr()
     assert offsets(add_priors(cstr(), {"V": 1.0, "q": 2.0}), np.array([0.1, 440.0, 3.0, 4.0])) == {
         "V": 3.0,
         "q": 4.0,
@@ -103,7 +105,8 @@ def test_no_parameter_costs_the_filter_a_state_unless_it_is_uncertain() -> None:
 
 
 def test_tolerances_are_shares_or_numbers_with_the_unit_of_the_parameter() -> None:
-    assert parse_priors("K3=2%, Tf = 0.5K,V=1.5e0 l", cstr()) == pytest.approx({"K3": 14.0, "Tf": 0.5, "V": 1.5})
+    priors = parse_priors("K3=2%, Tf = 0.5K,V=1.5e0 l,q=0,Cf=0%", cstr())
+    assert priors == pytest.approx({"K3": 14.0, "Tf": 0.5, "V": 1.5, "q": 0.0, "Cf": 0.0})
 
 
 def test_a_share_of_a_temperature_in_celsius_is_refused() -> None:
@@ -122,7 +125,8 @@ def test_a_share_of_a_temperature_in_celsius_is_refused() -> None:
         ("K3=2", "in % or in l/min, got '2'"),
         ("Tf=0.5C", "in % or in K, got '0.5C'"),
         ("Tf=-1K", "parameter=tolerance"),
-        ("Tf=0K", "positive number of K, got 0"),
+        ("Tf=351K", "at most its value, 350 K, got 351; state its standard deviation, or correct its value"),
+        ("K3=101%", "at most its value, 700 l/min, got 707"),
         ("Tf=1.2.3K", "must be a number with % or K"),
         ("", "parameter=tolerance"),
     ],
@@ -133,8 +137,19 @@ def test_an_impossible_prior_is_refused_in_one_line(text: str, said: str) -> Non
 
 
 @pytest.mark.parametrize(
-    ("uncertain", "said"), [({"p": 1.0}, "got p"), ({"K3": 0.0}, "positive"), ({"K3": np.nan}, "positive")]
+    ("uncertain", "said"),
+    [({"p": 1.0}, "got p"), ({"K3": -1.0}, "not negative"), ({"K3": np.nan}, "not negative"), ({"V": 1e3}, "at most")],
 )
-def test_a_standard_deviation_has_to_be_of_a_parameter_and_positive(uncertain: dict[str, float], said: str) -> None:
+def test_a_standard_deviation_is_of_a_parameter_and_neither_negative_nor_above_its_value(
+    uncertain: dict[str, float], said: str
+) -> None:
     with pytest.raises(InputError, match=said):
         diagnose(record_of(rows=400), cstr(), uncertain=uncertain)
+
+
+def test_a_parameter_stated_to_be_exact_is_none_of_the_uncertain_ones() -> None:
+    found, exact = (
+        diagnose(tank_record(gain=1.1), tank(), (Gain(), Shift()), uncertain=uncertain)
+        for uncertain in ({}, {"gain": 0.0})
+    )
+    assert exact.to_dict() == found.to_dict()

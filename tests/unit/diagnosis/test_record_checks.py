@@ -4,6 +4,7 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
+import casadi as ca
 import numpy as np
 import pytest
 from hypothesis import assume, given, settings
@@ -13,15 +14,20 @@ from numpy.typing import NDArray
 from reactorwatch.api.simulation import simulate_along
 from reactorwatch.arrays import Array
 from reactorwatch.cli.diagnose import DiagnosisOptions, load_case
+from reactorwatch.diagnosis.diagnose import diagnose
 from reactorwatch.diagnosis.fitting.outliers import find_gross_outliers, find_outliers, remove_outliers
-from reactorwatch.diagnosis.record_checks import make_run
+from reactorwatch.diagnosis.record_checks import describe_short_record, make_run
 from reactorwatch.diagnosis.run import Run
 from reactorwatch.errors import InputError
+from reactorwatch.process.effect import Effect
+from reactorwatch.process.generic import generic_effects
 from reactorwatch.process.library.cascaded_tanks import tanks
 from reactorwatch.process.library.cstr import cstr
+from reactorwatch.process.model import ProcessModel, variable
 from reactorwatch.records.record import Record
 from reactorwatch.records.write import write_table
 from tests.tables import read_csv
+from tests.unit.diagnosis.linear_tank import RATE, Gain, Shift, tank, tank_record
 from tests.unit.diagnosis.rig import Rig
 from tests.unit.diagnosis.rig import record_of as rig_record
 from tests.unit.diagnosis.runs import record_of
@@ -165,3 +171,44 @@ def test_left_out_is_as_missing_and_a_run_without_outliers_stays_itself() -> Non
     assert (found.values, found.breaks) == (5, (1,))
     begun = remove_outliers(run, np.array([[False, True], [False, False], [False, False]]))
     np.testing.assert_array_equal(begun.measured, [[np.nan, np.nan], [2.0, 3.0], [4.0, 5.0]])
+
+
+def without_input() -> ProcessModel:
+    """A tank whose inflow is a constant of its equations."""
+    model = tank()
+    return replace(model, inputs=(), rhs=(ca.substitute(model.rhs[0], model.inputs[0].symbol, 5.0),))
+
+
+def with_second_input() -> ProcessModel:
+    """A tank with another inflow, `v`."""
+    model = tank()
+    v = variable("v", "m", (0.0, 20.0), 1.0, "another inflow")
+    return replace(model, inputs=(*model.inputs, v), rhs=(model.rhs[0] + RATE * v.symbol,))
+
+
+def test_a_process_without_inputs_is_refused_in_one_line() -> None:
+    with pytest.raises(InputError, match=r"needs a process with an input, tank has none; .*: make what moves"):
+        make_run(tank_record(), without_input())
+
+
+@pytest.mark.parametrize("late_rows", [0, 2], ids=["exact", "with nuisance"])
+def test_causes_that_an_input_hides_that_never_moved_are_named(late_rows: int) -> None:
+    record = tank_record(noise_sd=0.02)
+    level = np.concatenate([np.full(late_rows, record.columns["h"][0]), record.columns["h"]])[: record.rows]
+    still = replace(record, columns=record.columns | {"h": level, "v": np.zeros(record.rows)})
+    found = diagnose(still, with_second_input(), (Gain(), Shift(), *input_effects("v")))
+    (note,) = [remark for remark in found.remarks if "never moved" in remark]
+    assert note.startswith("v (0) never moved, so these causes cannot be seen until it does: ")
+    assert note.split(": ")[1] == "v.gain, v.lag, v.delay, v.stiction"
+
+
+def test_of_a_record_with_fewer_rows_than_nuisance_the_needed_rows_are_stated() -> None:
+    run = make_run(tank_record(), tank())
+    assert describe_short_record(run, run.time_min.size) == []
+    (remark,) = describe_short_record(run, 700)
+    assert remark.startswith("600 rows are few for the 700 parameters of the nuisance, ")
+    assert remark.endswith(": record at least 700 rows")
+
+
+def input_effects(name: str) -> list[Effect]:
+    return [effect for effect in generic_effects(with_second_input()) if effect.name.startswith(f"{name}.")]

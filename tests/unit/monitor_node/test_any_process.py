@@ -4,6 +4,7 @@ It has three states, one of them not measured, and two inputs (`tests.cascade`).
 """
 
 import pickle
+import re
 import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -30,7 +31,7 @@ from reactorwatch.records.record import Record
 from reactorwatch.runtime.jobs import ProcessExecutor, SerialExecutor
 from recorder.tools.player import samples_of
 from tests import cascade
-from tests.cascade import FORMS, USUAL, simulate, write_forms
+from tests.cascade import DESCRIBED, FORMS, USUAL, simulate, write_forms
 
 TRAINING, FAULT, ROWS, START_NS = 250, 320, 450, 1_750_000_000 * 10**9
 
@@ -69,6 +70,15 @@ def test_a_back_test_finds_the_deviation_in_the_training_and_the_cause_of_the_al
     smallest = {item.deviation: item.within_1_h for item in found.power if not item.profile}
     assert set(names.values()) <= set(smallest)
     assert 0.0 < (smallest[names["g"]] or 0.0) < 0.05
+
+
+def test_a_training_adjusts_the_parameters_that_the_process_calls_uncertain(folder: Path) -> None:
+    (folder / "roughly.toml").write_text(DESCRIBED.replace("sd = 0.0002", "sd = 0.01"))
+    found = rw.backtest(simulate(ROWS, 3, (0, "k", 0.03)), process=folder / "roughly.toml", training_rows=TRAINING)
+    assert found.baseline is not None
+    (adjusted,) = re.findall(r"agrees with the equations; k is (\S+) 1/min", found.baseline.why)
+    assert float(adjusted) == pytest.approx(0.03, rel=0.02)
+    assert not found.alarms
 
 
 @pytest.mark.parametrize(
