@@ -4,7 +4,7 @@
 |---|---|
 | initial state of each part of the record | sd 3 scales of the state |
 | every effect of the catalogue, from the first row | sd kappa times its typical size; an uncertain parameter's own sd |
-| delay of each input (negative: acts before its stamp) and output (measured after it) | sd lambda times a row, at least 0.1 min |
+| delay of each input and output; of an output negative: measured after its stamp | sd lambda rows, at least 0.1 min |
 | first-order lag of each input and output | sd 3 lambda times a row, at least 0.1 min; not negative |
 | time of each move of an input inside its interval | sd 0.29 of the interval (uniform), if any |
 
