@@ -375,6 +375,8 @@ def diagnosis_text(diagnosis: "Diagnosis", effects: Sequence[Effect]) -> str:
         lines.append(_line("share", describe_weight(diagnosis.causes[0])))
     if diagnosis.nuisance and diagnosis.verdict != "nominal":
         lines.append(_line("corrections", f"{describe_nuisance(diagnosis)}  (95 %), from the first row on"))
+    if diagnosis.causes and (after := following(diagnosis)) is not None:
+        lines.append(_line("next", f"{after.label} ({after.cause}, {after.profile}), which {describe_weight(after)}"))
     if diagnosis.verdict == "unknown":
         lines += [
             _line(
@@ -399,8 +401,6 @@ def diagnosis_text(diagnosis: "Diagnosis", effects: Sequence[Effect]) -> str:
         lines.append(_line("held out", describe_holdout(name, item, improved=diagnosis.is_extended)))
     if not ambiguous:
         lines += _alternatives(diagnosis, effects) + _experiment(diagnosis)
-    if diagnosis.causes and (after := following(diagnosis)) is not None:
-        lines.append(_line("next", f"{after.label} ({after.cause}, {after.profile}), which {describe_weight(after)}"))
     lines += [_line("note", remark) for remark in diagnosis.remarks]
     return printable_lines(lines)
 

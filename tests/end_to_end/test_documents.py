@@ -35,6 +35,7 @@ ENGINE = "needs an engine for containers"
 CLUSTER = "needs a cluster"
 REGISTRY = "needs a registry of images"
 INDEX = "needs a package index"
+SLOW = "as the commands above, each computes for ten seconds"
 DASK = "needs a Dask cluster, tests/integration/{} has one"
 DASK_WORKER = "dask worker tls://10.0.0.3:8786 --nthreads 1 --no-nanny --no-dashboard --resources monitor=1"
 PLACE = "reactorwatch monitor --config SITE/fleet/monitor/settings.toml --shards 5 --scheduler tls://10.0.0.3:8786"
@@ -73,6 +74,14 @@ NOT_HERE = {
         ("cp -r deploy/systemd/reactorwatch-shard@.service.d /etc/systemd/system/", ROOT_ONLY),
         ("systemctl enable --now reactorwatch-shard@1 reactorwatch-shard@2", ROOT_ONLY),
         ("pip install 'reactorwatch[metrics]'", INDEX),
+    ],
+    "docs/diagnosis.md": [
+        (f"reactorwatch diagnose {arguments}", SLOW)
+        for arguments in (
+            "leak.csv --process three_tanks --without leak3",
+            "leak.csv --process three_tanks --without leak3 --without pump1 --without leak1",
+            "wave.csv --process three_tanks",
+        )
     ],
     "docs/fleet.md": [
         (command, DASK.format("test_placement.py"))

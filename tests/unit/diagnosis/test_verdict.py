@@ -1,12 +1,15 @@
 """The verdict of a search: a table of hypotheses and the verdict, at and beside the stated differences of BIC."""
 
 from dataclasses import dataclass
+from itertools import takewhile
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
+import reactorwatch.diagnosis.decide as decide_module
 from reactorwatch.diagnosis.decide import (
     SURE,
     Found,
@@ -168,3 +171,14 @@ def test_a_law_stays_unless_a_cause_with_an_onset_explains_the_record() -> None:
 @pytest.mark.parametrize("verdict", [NOMINAL, NAMED, AMBIGUOUS, UNKNOWN])
 def test_without_nuisance_the_verdict_of_the_search_stays(verdict: str) -> None:
     assert decide(verdict, 0.97, 3.0, None, []) == Verdict(verdict, grade_of(verdict, 0.97, 3.0))
+
+
+def test_the_page_has_the_table_of_the_decision() -> None:
+    def table(text: str) -> list[str]:
+        lines = text.splitlines()
+        first = next(row for row, line in enumerate(lines) if line.startswith("| condition, the first that holds |"))
+        return list(takewhile(lambda line: line.startswith("|"), lines[first:]))
+
+    page = (Path(__file__).parents[3] / "docs" / "diagnosis.md").read_text(encoding="utf-8")
+    assert len(table(page)) > 4
+    assert table(page) == table(decide_module.__doc__ or "")
