@@ -24,7 +24,13 @@ from reactorwatch.process.effect import Effect
 from reactorwatch.process.extended_model import parse_extended_model
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import Record
-from reactorwatch.sentences.diagnosis import describe_causes, describe_size, describe_timing, describe_verdict
+from reactorwatch.sentences.diagnosis import (
+    describe_causes,
+    describe_rival,
+    describe_size,
+    describe_timing,
+    describe_verdict,
+)
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -80,7 +86,10 @@ class DiagnosisResult(Shown[Diagnosis]):
             (cause.label, cause.cause, cause.location, describe_size(cause, self.effects), describe_timing(cause))
             for cause in self.causes
         ]
-        others = [(describe_causes(item.causes, self.effects), f"{item.delta_bic:.1f}") for item in self.alternatives]
+        others = [
+            (describe_causes(item.causes, self.effects), describe_rival(item, self.result))
+            for item in self.alternatives
+        ]
         errors = [
             (f"{name}, {item.unit}", f"{item.rmse_before:.3g}", f"{item.rmse_after:.3g}", f"{item.noise_sd:.3g}")
             for name, item in self.gain.held_out.items()
@@ -89,7 +98,7 @@ class DiagnosisResult(Shown[Diagnosis]):
             [
                 html.headline(describe_verdict(self.result)),
                 html.table(("cause", "name", "where", "size (95 %)", "when"), causes),
-                html.table(("or", "worse by, in BIC"), others),
+                html.table(("or", "compared"), others),
                 html.table(("error of the simulation", "as it was", "extended", "noise"), errors),
                 *map(html.sentence, self.remarks),
             ]
