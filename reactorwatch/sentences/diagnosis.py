@@ -394,9 +394,10 @@ def diagnosis_text(diagnosis: "Diagnosis", effects: Sequence[Effect]) -> str:
             for item in diagnosis.nearest
             if item.share >= 0.01
         ]
-    if len(diagnosis.locations) > 1:
+    if len(diagnosis.locations) > 1 and diagnosis.verdict != "named":  # named causes have their places
         places = [
-            describe_place(item.location) + (f", worse by {item.delta_bic:.1f} in BIC" if item.delta_bic else "")
+            describe_place(item.location)
+            + (f", worse by {item.delta_bic:.1f} in BIC" if item.delta_bic >= 0.05 else "")
             for item in diagnosis.locations
         ]
         lines.append(_line("where", "; ".join(places)))
