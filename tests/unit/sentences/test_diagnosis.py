@@ -166,7 +166,7 @@ def test_a_delay_is_described_by_when_a_signal_is_measured_or_acts(name: str, mi
     assert describe_correction(Nuisance(name, Estimate(minutes, 0.0, "min"), 0.1), ("C", "T")) == expected
 
 
-def test_a_sound_simulation_that_errs_by_more_than_the_noise_is_right_as_far_as_the_record_tells() -> None:
+def test_a_sound_simulation_that_errs_by_more_than_the_noise_is_right_with_a_reservation() -> None:
     nominal = CASES["nominal"]
     held_out = nominal.gain.held_out | {"T": replace(nominal.gain.held_out["T"], rmse_after=0.6)}
     assert describe_verdict(replace(nominal, gain=replace(nominal.gain, held_out=held_out))) == (
