@@ -76,8 +76,8 @@ def describe_verdict(diagnosis: "Diagnosis", *, are_listed: bool = False) -> str
         return f"The simulation is wrong{mostly} {'; and '.join(causes)}{alike}.{share} {matters}"
     where = f"it acts {describe_place(diagnosis.location)}" if diagnosis.location else "this record does not tell where"
     text = f"The simulation is wrong, and no known cause explains it; {where}."
-    if diagnosis.grade == "nearest":
-        nearest = diagnosis.nearest[0]
+    if diagnosis.grade == "nearest" and (near := nearest_causes(diagnosis)):
+        nearest = near[0]
         text += f" Nearest is {nearest.label}, which removes {percent(nearest.share)} of the squared error."
     if diagnosis.law is not None:
         text += f" A law explains it: {diagnosis.law.formula}, {diagnosis.law.term}."
@@ -304,8 +304,7 @@ def format_error(value: float, unit: str) -> str:
 
 def describe_remaining(item: "Remaining") -> str:
     """Error of an output that is left, beside the noise."""
-    where = f", {describe_place(item.location)}" if item.location else ""
-    return f"{format_error(item.rmse, item.unit)}{where}; the noise alone is {item.noise_sd:.3g} {item.unit}"
+    return f"{format_error(item.rmse, item.unit)}; the noise alone is {item.noise_sd:.3g} {item.unit}"
 
 
 def describe_holdout(name: str, item: "HeldOut", *, improved: bool) -> str:
@@ -344,6 +343,13 @@ def following(diagnosis: "Diagnosis") -> "Cause | None":
     listed = {item.cause for item in diagnosis.causes}
     listed |= {item.cause for other in diagnosis.alternatives for item in other.explanation}
     return next((item for item in diagnosis.nearest if item.cause not in listed), None)
+
+
+def nearest_causes(diagnosis: "Diagnosis") -> list["Cause"]:
+    """Causes that remove part of the error that no cause explains, by that share."""
+    if diagnosis.verdict != "unknown":
+        return []
+    return sorted((item for item in diagnosis.nearest if item.share >= 0.01), key=lambda item: -item.share)
 
 
 def percent(share: float) -> str:
@@ -385,15 +391,9 @@ def diagnosis_text(diagnosis: "Diagnosis", effects: Sequence[Effect]) -> str:
         lines.append(_line("corrections", f"{describe_nuisance(diagnosis)}  (95 %), from the first row on"))
     if diagnosis.causes and (after := following(diagnosis)) is not None:
         lines.append(_line("next", f"{after.label} ({after.cause}, {after.profile}), which {describe_weight(after)}"))
-    if diagnosis.verdict == "unknown":
-        lines += [
-            _line(
-                "nearest",
-                f"{describe_explanation([item], effects)}; removes {percent(item.share)} of the squared error",
-            )
-            for item in diagnosis.nearest
-            if item.share >= 0.01
-        ]
+    for near in nearest_causes(diagnosis):
+        removed = f"removes {percent(near.share)} of the squared error"
+        lines.append(_line("nearest", f"{describe_explanation([near], effects)}; {removed}"))
     if len(diagnosis.locations) > 1 and diagnosis.verdict != "named":  # named causes have their places
         places = [
             describe_place(item.location)
