@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reactorwatch.arrays import Array
+from reactorwatch.codegen.compiled_function import CompiledFunction
 from reactorwatch.diagnosis.fitting.profiles import Signal
 from reactorwatch.diagnosis.run import Run
 from reactorwatch.process.effect import TIMING, Effect
@@ -97,13 +98,12 @@ class InexactSimulation:
         self.rows: NDArray[np.intp] = np.arange(0, rows, -(-rows // MOST_ROWS))
         self.begins = (0, *run.breaks)
         self._interval = np.diff(run.time_min)
-        self._functions_for_rows = dict[tuple[str, int, bool], ca.Function]()
         self._functions(extended, sizes)
         self._steps = 1
         self._find_steps(start)
 
     def _functions(self, extended: ProcessModel, sizes: Sequence[str]) -> None:
-        """CasADi's functions of a step and of the outputs, with their derivatives."""
+        """Compiled functions of a step and of the outputs, with their derivatives."""
         x, u, eta = (
             ca.SX.sym(name, size)
             for name, size in (("x", len(extended.states)), ("u", len(extended.inputs)), ("eta", len(sizes)))
@@ -113,17 +113,16 @@ class InexactSimulation:
         p = ca.vertcat(*(eta[index[item.name]] if item.name in index else item.value for item in extended.parameters))
         after = symbolic_step(extended)(x, u, p, t, t + 0.5 * h, h)[0]
         shown = extended.function()(x, u, p, t, t)[1]
-        self._step = ca.Function("step", [x, u, eta, t, h], [after])
-        self._step_slopes = ca.Function("slopes", [x, u, eta, t, h], [_jacobian(after, by) for by in (x, eta, u)])
-        self._output = ca.Function("output", [x, u, eta, t], [shown])
-        self._output_slopes = ca.Function("shown", [x, u, eta, t], [_jacobian(shown, by) for by in (x, eta)])
-
-    def _function_for(self, function: ca.Function, times: int, *, accumulated: bool = False) -> ca.Function:
-        """The function for many arguments at once, or for a sequence of steps."""
-        key = (function.name(), times, accumulated)
-        if key not in self._functions_for_rows:
-            self._functions_for_rows[key] = function.mapaccum(times) if accumulated else function.map(times)
-        return self._functions_for_rows[key]
+        of_step, of_row = [x, u, eta, t, h], [x, u, eta, t]
+        step = ca.Function("step", of_step, [after])
+        self._step, self._step_after_step = CompiledFunction(step), CompiledFunction(step, chained=1)
+        self._step_slopes = CompiledFunction(
+            ca.Function("slopes", of_step, [ca.jacobian(after, by) for by in (x, eta, u)])
+        )
+        self._output = CompiledFunction(ca.Function("output", of_row, [shown]))
+        self._output_slopes = CompiledFunction(
+            ca.Function("shown", of_row, [ca.jacobian(shown, by) for by in (x, eta)])
+        )
 
     def _find_steps(self, start: Array) -> None:
         """Find the smallest number of steps in a row, a power of two, that is accurate."""
@@ -158,44 +157,39 @@ class InexactSimulation:
             x[begin] = start
             if end - begin > 1:
                 part = slice(begin, end - 1)
-                steps = self._function_for(self._step, (end - begin - 1) * self._steps, accumulated=True)
-                states = np.array(steps(start, *self._arguments(inputs[part], eta[part], part)))
-                x[begin + 1 : end] = states[:, self._steps - 1 :: self._steps].T
+                arguments = self._arguments(inputs[part], eta[part], part)
+                (states,) = self._step_after_step.map(start, *arguments)
+                x[begin + 1 : end] = states[self._steps - 1 :: self._steps, :, 0]
         if not np.all(np.isfinite(x)):
             return None
-        shown, where = self._function_for(self._output, rows), (x.T, self.run.inputs.T)
-        true = np.array(shown(*where, np.tile(self._neutral[:, None], rows), self.run.time_min)).T
-        y = np.array(shown(*where, (self._neutral + deviation.sample_value).T, self.run.time_min)).T
+        true, y = (
+            _by_column(self._output.map(x, self.run.inputs, sizes, self.run.time_min)[0])[:, :, 0]
+            for sizes in (np.tile(self._neutral, (rows, 1)), self._neutral + deviation.sample_value)
+        )
         return Simulated(x, true, y - true, inputs, deviation) if np.all(np.isfinite(y)) else None
 
     def _arguments(self, inputs: Array, eta: Array, part: slice) -> tuple[Array, ...]:
         """Inputs, sizes, times and lengths of all steps of an integration."""
         n, h = self._steps, self._interval[part] / self._steps
         times = (self.run.time_min[:-1][part][:, None] + h[:, None] * np.arange(n)).ravel()
-        return np.repeat(inputs, n, axis=0).T, np.repeat(eta, n, axis=0).T, times, np.repeat(h, n)
+        return np.repeat(inputs, n, axis=0), np.repeat(eta, n, axis=0), times, np.repeat(h, n)
 
     def slopes(self, simulated: Simulated) -> Slopes:
         """Derivatives along a simulation."""
         rows, n = self.run.time_min.size, self._steps
         eta = self._neutral + simulated.deviation.interval_mean[:-1]
         arguments = self._arguments(simulated.inputs, eta, slice(None))
-        states = [simulated.x[:-1]]
-        each, all_rows = (
-            self._function_for(self._step, rows - 1),
-            [item.reshape(*item.shape[:-1], rows - 1, n) for item in arguments],
-        )
-        for step in range(n - 1):
-            states.append(np.array(each(states[-1].T, *(item[..., step] for item in all_rows))).T)
+        x, all_rows = simulated.x[:-1], [item.reshape(rows - 1, n, *item.shape[1:]) for item in arguments]
         result: tuple[Array, ...] = ()
-        for step, x in enumerate(states):
-            found = self._function_for(self._step_slopes, rows - 1)(x.T, *(item[..., step] for item in all_rows))
-            a, b, g = (_by_row(item, rows - 1) for item in found)
+        for step in range(n):
+            of_step = [item[:, step] for item in all_rows]
+            a, b, g = map(_by_column, self._step_slopes.map(x, *of_step))
             result = (a @ result[0], a @ result[1] + b, a @ result[2] + g) if result else (a, b, g)
-        sizes = (self._neutral + simulated.deviation.sample_value).T
-        shown = self._function_for(self._output_slopes, rows)(
-            simulated.x.T, self.run.inputs.T, sizes, self.run.time_min
-        )
-        return Slopes(*result, *(_by_row(item, rows) for item in shown))
+            if step < n - 1:
+                x = self._step.map(x, *of_step)[0][:, :, 0]
+        sizes = self._neutral + simulated.deviation.sample_value
+        shown = self._output_slopes.map(simulated.x, self.run.inputs, sizes, self.run.time_min)
+        return Slopes(*result, *map(_by_column, shown))
 
     def propagate(self, slopes: Slopes, starts: Array, forcing: "Forcing") -> Array:
         """Derivatives of the true outputs at the kept rows, shape (kept rows, n_y, n).
@@ -301,11 +295,6 @@ class ProductForcing(Forcing):
         return np.asarray(products.reshape(rows.size, slopes.d.shape[1], -1))
 
 
-def _jacobian(expression: ca.SX, by: ca.SX) -> ca.SX:
-    return ca.densify(ca.jacobian(expression, by))
-
-
-def _by_row(values: ca.DM, rows: int) -> Array:
-    """Matrices that CasADi puts side by side, shape (rows, ...)."""
-    side_by_side = np.array(values)
-    return np.asarray(side_by_side.reshape(side_by_side.shape[0], rows, -1).transpose(1, 0, 2))
+def _by_column(values: Array) -> Array:
+    """The same values, shape (rows, n, ...), those of a column side by side in memory, as they are summed."""
+    return np.ascontiguousarray(values.swapaxes(0, 1)).swapaxes(0, 1)
