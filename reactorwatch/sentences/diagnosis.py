@@ -32,7 +32,8 @@ INDENT = 14
 TIME = "time"  # the axis of time in a difference
 
 MOSTLY_NOISE, WORSE = 0.9, 1.2
-"""Noise share above which no range is named; error of a range, relative to all rows, above which it is named."""
+"""Noise share above which no range is named; error above which a range or an output is named, relative to that of all
+rows, or to the noise."""
 
 
 def describe_verdict(diagnosis: "Diagnosis", *, are_listed: bool = False) -> str:
@@ -48,6 +49,13 @@ def describe_verdict(diagnosis: "Diagnosis", *, are_listed: bool = False) -> str
     if diagnosis.verdict == "nominal" and diagnosis.with_nuisance:
         return "The simulation is right but for corrections that are too small to be listed one by one."
     if diagnosis.verdict == "nominal":
+        more = [name for name, item in diagnosis.gain.held_out.items() if item.rmse_after > WORSE * item.noise_sd]
+        if more:
+            return (
+                f"The simulation is right as far as this record tells: {' and '.join(more)} "
+                f"{'differs' if len(more) == 1 else 'differ'} by more than the noise of the sensor, but no cause "
+                "explains that better than disturbances of the process do."
+            )
         return "The simulation is right: the rest of the record is noise."
     matters = describe_significance(diagnosis)
     if diagnosis.verdict == "ambiguous":
@@ -386,9 +394,13 @@ def diagnosis_text(diagnosis: "Diagnosis", effects: Sequence[Effect]) -> str:
             for item in diagnosis.nearest
             if item.share >= 0.01
         ]
-    if len(diagnosis.locations) > 1:
-        places = [f"{describe_place(item.location)} ({item.delta_bic:.1f})" for item in diagnosis.locations]
-        lines.append(_line("where", f"{', '.join(places)}: worse in BIC"))
+    if len(diagnosis.locations) > 1 and diagnosis.verdict != "named":  # named causes have their places
+        places = [
+            describe_place(item.location)
+            + (f", worse by {item.delta_bic:.1f} in BIC" if item.delta_bic >= 0.05 else "")
+            for item in diagnosis.locations
+        ]
+        lines.append(_line("where", "; ".join(places)))
     if diagnosis.law is not None:
         lines += [_line(name, text) for name, text in law_rows(diagnosis.law)]
     if diagnosis.is_extended and not diagnosis.with_nuisance:
