@@ -388,7 +388,7 @@ def diagnosis_text(diagnosis: "Diagnosis", effects: Sequence[Effect]) -> str:
     if diagnosis.causes and isfinite(diagnosis.causes[0].share) and not ambiguous:
         lines.append(_line("share", describe_weight(diagnosis.causes[0])))
     if diagnosis.nuisance and diagnosis.verdict != "nominal":
-        lines.append(_line("corrections", f"{describe_nuisance(diagnosis)}  (95 %), from the first row on"))
+        lines.append(_line("corrections", f"{describe_nuisance(diagnosis)}  (95 %)"))
     if diagnosis.causes and (after := following(diagnosis)) is not None:
         lines.append(_line("next", f"{after.label} ({after.cause}, {after.profile}), which {describe_weight(after)}"))
     for near in nearest_causes(diagnosis):

@@ -137,8 +137,7 @@ def test_with_nuisance_people_read_shares_probabilities_and_corrections_instead_
     text = diagnosis_text(CASES["inexact"], EFFECTS)
     for part in (
         "share       removes 97 % of the squared error; 48 % likely",
-        "corrections T is measured 2.00 ± 0.20 s after its stamp, C lags by 12 ± 2 s, volume 1.2 ± 0.4 %  (95 %), "
-        "from the first row on",
+        "corrections T is measured 2.00 ± 0.20 s after its stamp, C lags by 12 ± 2 s, volume 1.2 ± 0.4 %  (95 %)",
         "or          fouled jacket (heat_transfer, step): ",
         ", since 150.30 ± 0.20 min, which acts the same in this record",
         "next        wrong feed temperature (feed_temperature, step), which removes 41 % of the squared error; "
