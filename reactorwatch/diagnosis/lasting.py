@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 
 from reactorwatch.arrays import Array
 from reactorwatch.diagnosis.fitting.colored_noise import Noise
+from reactorwatch.diagnosis.fitting.descent import Equations, descend
 from reactorwatch.diagnosis.fitting.fault_filter import FaultFilter, FilterEvaluation
 from reactorwatch.diagnosis.fitting.hypothesis import Hypothesis
 from reactorwatch.diagnosis.fitting.profiles import Constant
-from reactorwatch.diagnosis.fitting.signatures import solve_bounded
 from reactorwatch.diagnosis.fitting.simulation import FittedSimulation
 from reactorwatch.diagnosis.holdout import evaluate_holdout, holdout_rows, is_near_noise, rms
 from reactorwatch.diagnosis.run import Run
@@ -41,8 +41,6 @@ MOST_CAUSES, MOST_TOGETHER, BRANCHES = 8, 3, 2
 
 FIRST_STEPS, STEPS, ROUNDS = 4, 12, 2
 """Steps from each start, from the best start, and estimates of the error's size."""
-
-_DAMPING, _LARGEST_DAMPING, _CONVERGED = 1e-3, 1e4, 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,11 +167,20 @@ def fit_lasting(
     if fitted is None:
         return None
     hidden = holdout_rows(run).astype(np.bool_)
-    without = fitter.fit_without(hidden, fitted[0])
-    errors, unseen = (run.measured - item.innovations.prediction for item in (fitted[1], without))
-    values = dict(zip(fitter.names, fitted[0].tolist(), strict=True))
-    sds = dict(zip(fitter.names, fitter.sds(*fitted).tolist(), strict=True))
+    without = fitter.fit_without(hidden, fitted.p)
+    errors, unseen = (run.measured - item.evaluation.innovations.prediction for item in (fitted, without))
+    values = dict(zip(fitter.names, fitted.p.tolist(), strict=True))
+    sds = dict(zip(fitter.names, fitter.sds(fitted).tolist(), strict=True))
     return LastingFit(effects, values, sds, _rms(errors), _rms(unseen[hidden]))
+
+
+@dataclass(frozen=True, eq=False)
+class _Point:
+    """Parameters, the run of the simulation with them, and the loss with their priors."""
+
+    p: Array
+    evaluation: FilterEvaluation
+    loss: float
 
 
 class _SimulationFitter:
@@ -208,66 +215,55 @@ class _SimulationFitter:
         sd = [max(float(np.nanstd(column)), 1e-12) for column in run.measured.T]
         self._simulation = FittedSimulation(extended, self.names, run, _sensor_noise(sd, extended))
 
-    def fit(self) -> tuple[Array, FilterEvaluation] | None:
-        """Parameters and run of the best fit; None if every start diverges."""
+    def fit(self) -> _Point | None:
+        """The best fit; None if every start diverges."""
         tried = [item for item in (self._climb(start, FIRST_STEPS) for start in self._first) if item is not None]
         if not tried:
             return None
-        best = min(tried, key=lambda item: self._loss(*item))
+        best = min(tried, key=lambda item: item.loss)
         for _ in range(ROUNDS):
-            residual = self._simulation.run.measured - best[1].innovations.prediction
+            residual = self._simulation.run.measured - best.evaluation.innovations.prediction
             ekf = self._simulation.ekf
             ekf.noise = _sensor_noise(np.maximum(_rms(residual), 1e-12).tolist(), ekf.model)
-            best = self._climb(best[0], STEPS) or best
+            best = self._climb(best.p, STEPS) or best
         return best
 
-    def sds(self, p: Array, evaluation: FilterEvaluation) -> Array:
+    def sds(self, point: _Point) -> Array:
         """Standard deviations of the parameters at a fit."""
-        return np.sqrt(np.diag(np.linalg.pinv(self._normal_equations(p, evaluation)[0], hermitian=True)))
+        return np.sqrt(np.diag(np.linalg.pinv(self._normal_equations(point)[0], hermitian=True)))
 
-    def fit_without(self, hidden: NDArray[np.bool_], start: Array) -> FilterEvaluation:
-        """Run of a fit to the other rows."""
+    def fit_without(self, hidden: NDArray[np.bool_], start: Array) -> _Point:
+        """Fit to the other rows."""
         whole = self._simulation.run
         self._simulation.run = replace(whole, measured=np.where(hidden[:, None], np.nan, whole.measured))
         fitted = self._climb(start, STEPS)
         self._simulation.run = whole
-        return self._evaluate(start) if fitted is None else fitted[1]
+        return self._evaluate(start) if fitted is None else fitted
 
-    def _climb(self, p: Array, steps: int) -> tuple[Array, FilterEvaluation] | None:
-        """Damped Gauss-Newton steps from a start; None if the simulation diverges there."""
-        best, damping = (p, self._evaluate(p)), _DAMPING
-        if not np.all(np.isfinite(best[1].innovations.prediction[1:])):
+    def _climb(self, p: Array, steps: int) -> _Point | None:
+        """Descend from a start; None if the simulation diverges there."""
+        start = self._evaluate(p)
+        if not np.all(np.isfinite(start.evaluation.innovations.prediction[1:])):
             return None
-        for _ in range(steps):
-            information, gradient = self._normal_equations(*best)
-            if not np.all(np.isfinite(information)):
-                break
-            before = self._loss(*best)
-            while damping < _LARGEST_DAMPING:
-                damped = information + damping * np.diag(np.diag(information))
-                step = solve_bounded(damped, gradient, self._lower - best[0], self._upper - best[0])[1]
-                trial = np.clip(best[0] + step, self._lower, self._upper)
-                other = (trial, self._evaluate(trial))
-                if self._loss(*other) < before:
-                    best, damping = other, 0.1 * damping
-                    break
-                damping *= 10.0
-            if before - self._loss(*best) < _CONVERGED:
-                break
-        return best
+        return descend(start, self._solvable_equations, self._move, steps)
 
-    def _evaluate(self, p: Array) -> FilterEvaluation:
-        return self._simulation.evaluate(self._values(p))
+    def _solvable_equations(self, point: _Point) -> Equations | None:
+        known = self._normal_equations(point)
+        return known if np.all(np.isfinite(known[0])) else None
+
+    def _move(self, point: _Point, step: Array) -> _Point:
+        return self._evaluate(np.clip(point.p + step, self._lower, self._upper))
+
+    def _evaluate(self, p: Array) -> _Point:
+        evaluation = self._simulation.evaluate(self._values(p))
+        return _Point(p, evaluation, evaluation.loss + 0.5 * float(np.sum(self._weight * (p - self._mean) ** 2)))
 
     def _values(self, p: Array) -> dict[str, float]:
         return dict(zip(self.names, p.tolist(), strict=True))
 
-    def _loss(self, p: Array, evaluation: FilterEvaluation) -> float:
-        return evaluation.loss + 0.5 * float(np.sum(self._weight * (p - self._mean) ** 2))
-
-    def _normal_equations(self, p: Array, evaluation: FilterEvaluation) -> tuple[Array, Array]:
-        information, gradient = self._simulation.normal_equations(self._values(p), evaluation)
-        return information + np.diag(self._weight), gradient - self._weight * (p - self._mean)
+    def _normal_equations(self, point: _Point) -> Equations:
+        information, gradient = self._simulation.normal_equations(self._values(point.p), point.evaluation)
+        return information + np.diag(self._weight), gradient - self._weight * (point.p - self._mean)
 
 
 def _names(effect: Effect) -> tuple[str, ...]:

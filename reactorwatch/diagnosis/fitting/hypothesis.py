@@ -4,7 +4,7 @@ The loss is the negative log likelihood of the innovations of the extended model
 Huber (1964, Robust estimation of a location parameter, Annals of Mathematical Statistics 35): it is linear beyond
 `HUBER` standard deviations. With process noise the filter follows the measurements, without any it is a simulation; so
 a plant that starts on another branch, or is extinguished, does not mislead the fit. The loss is minimised by
-Gauss-Newton steps with Levenberg-Marquardt damping. Derivatives come from the filter's error equations (`signatures`).
+damped Gauss-Newton steps (`descent`). Derivatives come from the filter's error equations (`signatures`).
 Magnitudes of discontinuous effects, such as stiction, have no derivatives and are scanned (`scan`).
 
 Prior probabilities of hypotheses, as costs in BIC (docs/decisions/0014-two-causes.md). Of n possible causes each is
@@ -23,6 +23,7 @@ import numpy as np
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.compiled_function import LANES
 from reactorwatch.diagnosis.fitting import signatures
+from reactorwatch.diagnosis.fitting.descent import CONVERGED, Equations, descend
 from reactorwatch.diagnosis.fitting.fault_filter import FaultFilter, SharedPrefix, huber_clip, huber_weights
 from reactorwatch.diagnosis.fitting.profiles import FittedProfile, Signal
 from reactorwatch.diagnosis.fitting.signatures import inverse
@@ -31,9 +32,8 @@ from reactorwatch.diagnosis.run import Run
 from reactorwatch.kalman.batch import FilterResult, StepCost
 from reactorwatch.kalman.error_dynamics import ErrorDynamics
 
-CONVERGED, WELL_CONVERGED = 0.05, 0.005
-"""Thresholds in log likelihood: a rough fit stops after a step that gains less than the first, a full fit when the
-predicted gain is below the second."""
+WELL_CONVERGED = 0.005
+"""Predicted gain in log likelihood below which a full fit ends."""
 
 MOST_STEPS = 12
 """Maximum number of steps of a fit."""
@@ -46,7 +46,6 @@ _RUNAWAY = 1e100
 
 _SHARE = 0.02
 _WIDENINGS, _WIDER = 10, 2.0
-_TRIES, _DAMPING, _MORE_DAMPING, _LESS_DAMPING = 5, 1e-3, 10.0, 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,40 +160,30 @@ class Hypothesis:
             steps: maximum number of steps; fewer than `MOST_STEPS` are for a rough fit.
             like: see `evaluate`.
         """
-        best = self.evaluate(run, start, like)
-        damping, enough = _DAMPING, WELL_CONVERGED if steps == MOST_STEPS else CONVERGED
-        differences = self._difference_steps()
-        for _ in range(steps):
+        is_rough = steps < MOST_STEPS
+        differences, last = self._difference_steps(), np.empty((0, 0))
+
+        def equations(point: Fit) -> Equations | None:
+            nonlocal differences, last
+            if last.size and any(profile.nonlinear_parameters for profile in self.profiles):
+                differences = self._widen(self._covariance(last), differences)
             with np.errstate(over="ignore", invalid="ignore"):
-                g = self._jacobian(run, best, differences, rough=steps < MOST_STEPS)
-            w = np.nan_to_num(best.w[2:]).ravel()
+                last = g = self._jacobian(run, point, differences, rough=is_rough)
             if not np.any(g) or not np.max(np.abs(g)) < _RUNAWAY:
-                break
+                return None
+            w = np.nan_to_num(point.w[2:]).ravel()
             weights = huber_weights(w)
             weighted = g * np.sqrt(weights)[:, None]
             squares = signatures.gram_of_columns(weighted) if self.n_parameters > MANY else weighted.T @ weighted
             information, gradient = squares + self._prior_information(), g.T @ (weights * w)
-            gradient[self.constant_indices] -= self._deviations(best.parameters) / self._constant_sds
-            scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
-            information, gradient = information / np.outer(scale, scale), gradient / scale
-            before = best
-            for _ in range(_TRIES):
-                scaled = np.linalg.lstsq(information + damping * np.eye(scale.size), gradient, rcond=1e-12)[0]
-                promised = float(scaled @ (gradient - 0.5 * information @ scaled))
-                if promised < enough:
-                    break
-                trial = self.evaluate(run, self._shift(best.parameters, scaled / scale), like)
-                if trial.loss < best.loss:
-                    best, damping = trial, damping * _LESS_DAMPING
-                    break
-                damping *= _MORE_DAMPING
-            gained = before.loss - best.loss
-            # A full step that gains what was predicted shows that the loss is quadratic here: nothing remains to gain.
-            if gained < CONVERGED or (damping < _DAMPING and abs(gained - promised) < enough):
-                break
-            if any(profile.nonlinear_parameters for profile in self.profiles):
-                differences = self._widen(self._covariance(g), differences)
-        return best
+            gradient[self.constant_indices] -= self._deviations(point.parameters) / self._constant_sds
+            return information, gradient
+
+        def move(point: Fit, step: Array) -> Fit:
+            return self.evaluate(run, self._shift(point.parameters, step), like)
+
+        enough = CONVERGED if is_rough else WELL_CONVERGED
+        return descend(self.evaluate(run, start, like), equations, move, steps, enough)
 
     def covariance(self, run: Run, fit: Fit, first_difference: float = 0.0) -> Array:
         """Covariance of all parameters, shape (n_parameters, n_parameters).

@@ -1,4 +1,4 @@
-"""Fit of a hypothesis with its nuisance to a run, by damped Gauss-Newton steps in a trust region.
+"""Fit of a hypothesis with its nuisance to a run, by damped Gauss-Newton steps (`fitting.descent`) in a trust region.
 
 The loss is that of the whitened residual and of the priors. The logarithm of the evidence is Laplace's approximation,
 
@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reactorwatch.arrays import Array
+from reactorwatch.diagnosis.fitting.descent import descend
 from reactorwatch.diagnosis.fitting.profiles import Signal
 from reactorwatch.diagnosis.inexact.hypotheses import (
     CONSTANT,
@@ -30,17 +31,14 @@ from reactorwatch.diagnosis.inexact.noise import Discrepancy
 from reactorwatch.diagnosis.inexact.nuisance import Linearised, Nuisance
 from reactorwatch.diagnosis.inexact.simulation import Forcing, Simulated
 
-STEPS, TRIES = 8, 6
-"""Steps of a fit, and dampings that are tried in each."""
+STEPS = 8
+"""Steps of a fit."""
 
 FARTHEST = 2.0
 """Radius of the trust region in standard deviations of the priors: further away the derivatives are others."""
 
 LIKELY = 3.0
 """Distance in standard deviations of its prior within which a fit starts."""
-
-CONVERGED = 0.05
-"""Gain in log likelihood below which a fit ends."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,6 +155,7 @@ class _Fit:
             self._lower = np.array([effect.lower - effect.neutral, times[0]])
             self._upper = np.array([effect.upper - effect.neutral, times[-1] - courses.period_min])
         self._all_sds = np.concatenate([self._sds, self._own_sds])
+        self._last: tuple[_Point, tuple[Array, Array, Array, Array]] | None = None
         self._moves: Array | None = None  # derivatives by the times of the inputs' moves, once they are known
 
     def climb(self, theta: Array) -> Fitted | None:
@@ -170,25 +169,11 @@ class _Fit:
         point = next((item for own in starts if (item := self._evaluate(theta, own)) is not None), None)
         if point is None:
             return None
-        damping, equations = 1e-3, self._normal_equations(point)
-        for _ in range(STEPS):
-            before, (_, _, information, gradient) = point, equations
-            for _ in range(TRIES):
-                damped = information + damping * np.diag(np.diag(information))
-                step = np.asarray(np.linalg.solve(damped, gradient), dtype=float)
-                other = self._evaluate(*self._move(point, step))
-                if other is not None and other.loss < point.loss:
-                    point, damping = other, 0.1 * damping
-                    break
-                damping = max(10.0 * damping, 1e-6)
-            if point is not before:
-                equations = self._normal_equations(point)
-            if before.loss - point.loss < CONVERGED:
-                break
-        return self._result(point, *equations[:3])
+        best = descend(point, lambda item: self._normal_equations(item)[2:], self._move, STEPS)
+        return self._result(best, *self._normal_equations(best)[:3])
 
-    def _move(self, point: _Point, step: Array) -> tuple[Array, Array]:
-        """Parameters after a step in the trust region and within their bounds."""
+    def _move(self, point: _Point, step: Array) -> _Point | None:
+        """The point after a step in the trust region and within the bounds."""
         step = step * min(1.0, FARTHEST / max(float(np.max(np.abs(step / self._all_sds))), 1e-12))
         n = self._sds.size
         own = point.own + step[n:]
@@ -196,7 +181,8 @@ class _Fit:
             reach = 0.5 * self._fitter._courses.span_min / ONSETS
             own[1] = point.own[1] + np.clip(step[n + 1], -reach, reach)
         nuisance = self._nuisance
-        return np.clip(point.theta + step[:n], nuisance.lower, nuisance.upper), np.clip(own, self._lower, self._upper)
+        theta = np.clip(point.theta + step[:n], nuisance.lower, nuisance.upper)
+        return self._evaluate(theta, np.clip(own, self._lower, self._upper))
 
     def _deviation(self, own: Array) -> Signal | None:
         """Deviations of all effects; None without any."""
@@ -231,7 +217,9 @@ class _Fit:
         return np.asarray(self._moves @ shares)
 
     def _normal_equations(self, point: _Point) -> tuple[Array, Array, Array, Array]:
-        """Derivatives, the same whitened, information and gradient at a point."""
+        """Derivatives, the same whitened, information and gradient at a point; those of the last one are kept."""
+        if self._last is not None and self._last[0] is point:
+            return self._last[1]
         found = self._nuisance.linearise(point.theta, point.simulated)
         derivatives = np.concatenate([found.nuisance, self._own_derivatives(point, found)], axis=2)
         masked = self._fitter.mask(derivatives)
@@ -243,7 +231,9 @@ class _Fit:
         deviations = np.concatenate([point.theta, point.own]) / self._all_sds**2
         if self._is_timed:
             deviations[-1] = 0.0
-        return masked, white, information, flat.T @ point.white.ravel() - deviations
+        result = masked, white, information, flat.T @ point.white.ravel() - deviations
+        self._last = point, result
+        return result
 
     def _own_derivatives(self, point: _Point, found: Linearised) -> Array:
         """Derivatives of the readings by the parameters of the cause."""

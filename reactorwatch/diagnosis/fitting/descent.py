@@ -1,0 +1,70 @@
+"""Damped Gauss-Newton descent of a loss (Marquardt 1963, J. SIAM 11), whose caller confines the steps."""
+
+from collections.abc import Callable
+from typing import Protocol, TypeVar
+
+import numpy as np
+
+from reactorwatch.arrays import Array
+
+CONVERGED = 0.05
+"""Gain in log likelihood below which a descent ends."""
+
+_TRIES, _DAMPING, _MORE_DAMPING, _LESS_DAMPING = 5, 1e-3, 10.0, 0.1
+
+
+class Point(Protocol):
+    """Parameters with their loss: minus the logarithm of the likelihood and of the prior."""
+
+    @property
+    def loss(self) -> float:
+        """The loss."""
+
+
+P = TypeVar("P", bound=Point)
+
+Equations = tuple[Array, Array]
+"""Information, shape (n, n), and gradient of the log likelihood, shape (n,)."""
+
+
+def descend(
+    start: P,
+    equations: Callable[[P], Equations | None],
+    move: Callable[[P, Array], P | None],
+    steps: int,
+    enough: float = CONVERGED,
+) -> P:
+    """Descend from a point to one with a smaller loss.
+
+    Args:
+        start: first point.
+        equations: normal equations at a point; None: they cannot be solved, and the descent ends.
+        move: the point after a step, shortened where it would leave the trust region or a bound; None: the model
+            diverges there.
+        steps: maximum number of steps.
+        enough: gain in log likelihood that is not worth a step.
+    """
+    best, damping = start, _DAMPING
+    for _ in range(steps):
+        known = equations(best)
+        if known is None:
+            break
+        information, gradient = known
+        scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
+        information, gradient = information / np.outer(scale, scale), gradient / scale
+        before, promised = best, 0.0
+        for _ in range(_TRIES):
+            scaled = np.linalg.lstsq(information + damping * np.eye(scale.size), gradient, rcond=1e-12)[0]
+            promised = float(scaled @ (gradient - 0.5 * information @ scaled))
+            if promised < enough:
+                break
+            trial = move(best, scaled / scale)
+            if trial is not None and trial.loss < best.loss:
+                best, damping = trial, damping * _LESS_DAMPING
+                break
+            damping *= _MORE_DAMPING
+        gained = before.loss - best.loss
+        # A full step that gains what was predicted shows that the loss is quadratic here: nothing remains to gain.
+        if gained < CONVERGED or (damping < _DAMPING and abs(gained - promised) < enough):
+            break
+    return best
