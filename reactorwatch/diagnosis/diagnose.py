@@ -1,6 +1,6 @@
 """Diagnose a simulation from a record and its model."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import replace
 from math import inf
 
@@ -223,7 +223,7 @@ def diagnose(
         if reported is None or unknown is None
         else describe_law(adjusted, run, unknown.found, reported, covariances, gain.held_out)
     )
-    worse = _locations(best, alternatives) if unknown is None else unknown.locations
+    worse = unknown.locations if unknown is not None else _locations(best, alternatives, {i.name for i in corrections})
     share = weights[nearest[0]].share if nearest else 0.0
     exact = Diagnosis(
         file=record.name,
@@ -339,12 +339,15 @@ def _may_be_unknown(result: SearchResult, best: FittedHypothesis, model: Process
     return _seems_noisy(result, model) or (from_beginning and (len(profiles) > 1 or FREE_NAME in profiles))
 
 
-def _locations(best: FittedHypothesis, alternatives: Sequence[FittedHypothesis]) -> dict[str, float]:
-    """BIC of each location of the explanations over that of the best."""
+def _locations(
+    best: FittedHypothesis, alternatives: Sequence[FittedHypothesis], corrections: Set[str]
+) -> dict[str, float]:
+    """BIC of each location of the explanations over that of the best; those of small corrections are left out."""
     result: dict[str, float] = {}
     for item in (best, *alternatives):
         for effect in item.hypothesis.filter.effects:
-            result.setdefault(effect.location, item.bic - best.bic)
+            if effect.name not in corrections:
+                result.setdefault(effect.location, item.bic - best.bic)
     return result
 
 

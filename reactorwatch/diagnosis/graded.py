@@ -43,6 +43,10 @@ SMALL = 1.1
 """Share of its typical size below which a constant deviation beside a cause with a larger effect is a small correction:
 data sheets and constants of the literature are no better than a typical size."""
 
+TINY = 0.1
+"""The same of a deviation with any course in time: a second effect so small mends the course of the first. The smallest
+ones that are worth finding have 0.1 to 0.8."""
+
 
 class Weight(NamedTuple):
     """Share of the squared error that an explanation removes, and its probability."""
@@ -138,7 +142,7 @@ def effect_sizes(item: FittedHypothesis, run: Run, tolerances: Array) -> list[fl
 def separate_corrections(
     causes: Sequence[Cause], sizes: Sequence[float], effects: Sequence[Effect]
 ) -> tuple[tuple[Cause, ...], tuple[Nuisance, ...]]:
-    """Causes by their effect on the outputs, the largest first, and small constant deviations beside them.
+    """Causes by their effect on the outputs, the largest first, and small deviations beside them.
 
     Args:
         causes: causes of an explanation.
@@ -150,7 +154,8 @@ def separate_corrections(
     small = [
         item
         for item in ordered[1:]
-        if item.profile == CONSTANT.name and abs(item.parameters["size"].value) < SMALL * typical.get(item.cause, 0.0)
+        if abs(item.parameters["size"].value)
+        < (SMALL if item.profile == CONSTANT.name else TINY) * typical.get(item.cause, 0.0)
     ]
     kept = tuple(item for item in ordered if item not in small)
     return kept, tuple(Nuisance(item.cause, item.parameters["size"], None) for item in small)

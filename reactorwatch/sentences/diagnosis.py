@@ -32,7 +32,8 @@ INDENT = 14
 TIME = "time"  # the axis of time in a difference
 
 MOSTLY_NOISE, WORSE = 0.9, 1.2
-"""Noise share above which no range is named; error of a range, relative to all rows, above which it is named."""
+"""Noise share above which no range is named; error above which a range or an output is named, relative to that of all
+rows, or to the noise."""
 
 
 def describe_verdict(diagnosis: "Diagnosis", *, are_listed: bool = False) -> str:
@@ -48,6 +49,13 @@ def describe_verdict(diagnosis: "Diagnosis", *, are_listed: bool = False) -> str
     if diagnosis.verdict == "nominal" and diagnosis.with_nuisance:
         return "The simulation is right but for corrections that are too small to be listed one by one."
     if diagnosis.verdict == "nominal":
+        more = [name for name, item in diagnosis.gain.held_out.items() if item.rmse_after > WORSE * item.noise_sd]
+        if more:
+            return (
+                f"The simulation is right as far as this record tells: {' and '.join(more)} "
+                f"{'differs' if len(more) == 1 else 'differ'} by more than the noise of the sensor, but no cause "
+                "explains that better than disturbances of the process do."
+            )
         return "The simulation is right: the rest of the record is noise."
     matters = describe_significance(diagnosis)
     if diagnosis.verdict == "ambiguous":
@@ -68,8 +76,8 @@ def describe_verdict(diagnosis: "Diagnosis", *, are_listed: bool = False) -> str
         return f"The simulation is wrong{mostly} {'; and '.join(causes)}{alike}.{share} {matters}"
     where = f"it acts {describe_place(diagnosis.location)}" if diagnosis.location else "this record does not tell where"
     text = f"The simulation is wrong, and no known cause explains it; {where}."
-    if diagnosis.grade == "nearest":
-        nearest = diagnosis.nearest[0]
+    if diagnosis.grade == "nearest" and (near := nearest_causes(diagnosis)):
+        nearest = near[0]
         text += f" Nearest is {nearest.label}, which removes {percent(nearest.share)} of the squared error."
     if diagnosis.law is not None:
         text += f" A law explains it: {diagnosis.law.formula}, {diagnosis.law.term}."
@@ -296,8 +304,7 @@ def format_error(value: float, unit: str) -> str:
 
 def describe_remaining(item: "Remaining") -> str:
     """Error of an output that is left, beside the noise."""
-    where = f", {describe_place(item.location)}" if item.location else ""
-    return f"{format_error(item.rmse, item.unit)}{where}; the noise alone is {item.noise_sd:.3g} {item.unit}"
+    return f"{format_error(item.rmse, item.unit)}; the noise alone is {item.noise_sd:.3g} {item.unit}"
 
 
 def describe_holdout(name: str, item: "HeldOut", *, improved: bool) -> str:
@@ -338,6 +345,13 @@ def following(diagnosis: "Diagnosis") -> "Cause | None":
     return next((item for item in diagnosis.nearest if item.cause not in listed), None)
 
 
+def nearest_causes(diagnosis: "Diagnosis") -> list["Cause"]:
+    """Causes that remove part of the error that no cause explains, by that share."""
+    if diagnosis.verdict != "unknown":
+        return []
+    return sorted((item for item in diagnosis.nearest if item.share >= 0.01), key=lambda item: -item.share)
+
+
 def percent(share: float) -> str:
     """A share or a probability in per cent.
 
@@ -374,21 +388,19 @@ def diagnosis_text(diagnosis: "Diagnosis", effects: Sequence[Effect]) -> str:
     if diagnosis.causes and isfinite(diagnosis.causes[0].share) and not ambiguous:
         lines.append(_line("share", describe_weight(diagnosis.causes[0])))
     if diagnosis.nuisance and diagnosis.verdict != "nominal":
-        lines.append(_line("corrections", f"{describe_nuisance(diagnosis)}  (95 %), from the first row on"))
+        lines.append(_line("corrections", f"{describe_nuisance(diagnosis)}  (95 %)"))
     if diagnosis.causes and (after := following(diagnosis)) is not None:
         lines.append(_line("next", f"{after.label} ({after.cause}, {after.profile}), which {describe_weight(after)}"))
-    if diagnosis.verdict == "unknown":
-        lines += [
-            _line(
-                "nearest",
-                f"{describe_explanation([item], effects)}; removes {percent(item.share)} of the squared error",
-            )
-            for item in diagnosis.nearest
-            if item.share >= 0.01
+    for near in nearest_causes(diagnosis):
+        removed = f"removes {percent(near.share)} of the squared error"
+        lines.append(_line("nearest", f"{describe_explanation([near], effects)}; {removed}"))
+    if len(diagnosis.locations) > 1 and diagnosis.verdict != "named":  # named causes have their places
+        places = [
+            describe_place(item.location)
+            + (f", worse by {item.delta_bic:.1f} in BIC" if item.delta_bic >= 0.05 else "")
+            for item in diagnosis.locations
         ]
-    if len(diagnosis.locations) > 1:
-        places = [f"{describe_place(item.location)} ({item.delta_bic:.1f})" for item in diagnosis.locations]
-        lines.append(_line("where", f"{', '.join(places)}: worse in BIC"))
+        lines.append(_line("where", "; ".join(places)))
     if diagnosis.law is not None:
         lines += [_line(name, text) for name, text in law_rows(diagnosis.law)]
     if diagnosis.is_extended and not diagnosis.with_nuisance:

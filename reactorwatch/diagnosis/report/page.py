@@ -12,7 +12,7 @@ from reactorwatch import html
 from reactorwatch.diagnosis.difference import Difference
 from reactorwatch.diagnosis.report import mathml, panels
 from reactorwatch.diagnosis.report.equations import Equation, balances, meanings
-from reactorwatch.diagnosis.result import AMBIGUOUS, NOMINAL, UNKNOWN, Cause, Diagnosis, Experiment
+from reactorwatch.diagnosis.result import AMBIGUOUS, NOMINAL, Cause, Diagnosis, Experiment
 from reactorwatch.diagnosis.whiteness import WHITE
 from reactorwatch.process import DEFAULT_PROCESS
 from reactorwatch.process.effect import Effect
@@ -34,6 +34,7 @@ from reactorwatch.sentences.diagnosis import (
     describe_weight,
     format_interval,
     law_rows,
+    nearest_causes,
     percent,
 )
 
@@ -94,7 +95,7 @@ def as_page(
         corrections=[
             (describe_correction(item, diagnosis.remaining), describe_prior(item)) for item in diagnosis.nuisance
         ],
-        nearest=diagnosis.nearest if diagnosis.verdict == UNKNOWN else (),
+        nearest=nearest_causes(diagnosis),
         percent=percent,
         where=describe_place,
         when=describe_timing,

@@ -142,7 +142,7 @@ def test_an_unknown_leads_with_the_nearest_causes() -> None:
         "nearest causes",
         "feed warmer by 1.23 K (± 0.10 K)",
         "41 %",
-        "left in T</th><td>0.9 K, in the energy",
+        "left in T</th><td>0.9 K; the noise",
     ):
         assert part in top
 

@@ -21,8 +21,11 @@ from reactorwatch.diagnosis.decide import (
     grade_of,
 )
 from reactorwatch.diagnosis.diagnose import _alternatives, _drop_hidden, _search_evidence
-from reactorwatch.diagnosis.result import AMBIGUOUS, LISTED, NAMED, NOMINAL, UNKNOWN
+from reactorwatch.diagnosis.graded import separate_corrections
+from reactorwatch.diagnosis.result import AMBIGUOUS, LISTED, NAMED, NOMINAL, UNKNOWN, Estimate, make_cause
 from reactorwatch.diagnosis.search.search import FittedHypothesis, SearchResult
+from reactorwatch.process import effects_of
+from reactorwatch.process.library.cstr import cstr
 
 BEST_BIC = 100.0
 LEAK, FOULING, SOURCE = "leak", "fouling", "source of A"
@@ -182,3 +185,27 @@ def test_the_page_has_the_table_of_the_decision() -> None:
     page = (Path(__file__).parents[3] / "docs" / "diagnosis.md").read_text(encoding="utf-8")
     assert len(table(page)) > 4
     assert table(page) == table(decide_module.__doc__ or "")
+
+
+@pytest.mark.parametrize(
+    ("profile", "share", "is_small"),
+    [("constant", 1.0, True), ("constant", 1.2, False), ("step", 0.08, True), ("step", 0.15, False)],
+)
+def test_a_small_deviation_beside_a_larger_one_is_a_correction_and_no_cause(
+    profile: str, share: float, *, is_small: bool
+) -> None:
+    effects = {effect.name: effect for effect in effects_of(cstr())}
+    first, other = effects["feed_temperature"], effects["reaction_heat"]
+    causes = [
+        make_cause(effect, name, {"size": Estimate(size * effect.typical, 0.0, effect.unit)})
+        for effect, name, size in ((other, profile, -share), (first, "step", 1.0))
+    ]
+    shown, corrections = separate_corrections(causes, [0.5, 3.0], tuple(effects.values()))
+    assert [item.cause for item in shown] == [first.name, other.name][: 2 - is_small]
+    assert [item.name for item in corrections] == [other.name] * is_small
+
+
+def test_a_cause_by_itself_is_no_correction_however_small() -> None:
+    (effect, *_) = effects = effects_of(cstr())
+    cause = make_cause(effect, "constant", {"size": Estimate(0.01 * effect.typical, 0.0, effect.unit)})
+    assert separate_corrections([cause], [0.01], effects) == ((cause,), ())
