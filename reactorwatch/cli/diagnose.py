@@ -29,6 +29,7 @@ from reactorwatch.diagnosis.report.panels import interval
 from reactorwatch.diagnosis.result import SD_95, Cause, Curves, Diagnosis, Experiment
 from reactorwatch.errors import InputError, UnfitRecordError
 from reactorwatch.process.model import ProcessModel
+from reactorwatch.progress import report_stage
 from reactorwatch.records.decode import is_table
 from reactorwatch.records.record import Record, to_time_ns
 from reactorwatch.records.write import atomic_write, check_output_folder, fill_folder, write_table
@@ -130,6 +131,7 @@ def run_job(job: Job[DiagnosisOptions]) -> JobResult:
     case, not_written = load_case(job.at, job.asked)._replace(file=str(job.file)), ""
     found = diagnose_case(case, job.asked.tolerance, job.asked.limits)
     if job.folder is not None:
+        report_stage("writing the report")
         try:
             write_report(found, job.file, job.folder, job.asked)
         except InputError as error:

@@ -268,7 +268,7 @@ class CodeCache:
     Args:
         folder: folder of the entries; made with the first one.
         capacity: largest number of entries, of some 30 kB each.
-        evicted: number of the oldest entries that are evicted when there are more.
+        evicted: number of entries that are evicted when there are more: those that were used longest ago.
     """
 
     def __init__(self, folder: Path, capacity: int = 4000, evicted: int = 1000) -> None:
@@ -290,6 +290,9 @@ class CodeCache:
         if digest != hashlib.sha256(code).digest():
             code = make()
             self._store(path, code)
+        else:
+            with suppress(OSError):  # of a folder that is only read, nothing is evicted
+                os.utime(path)
         return code
 
     def _store(self, path: Path, code: bytes) -> None:
@@ -305,7 +308,8 @@ class CodeCache:
                 temporary.unlink()
 
     def _evict(self) -> None:
-        entries = [item for item in os.scandir(self._folder) if item.is_file()]
+        entries = list(os.scandir(self._folder))
         if len(entries) > self._capacity:
-            for item in sorted(entries, key=lambda item: item.stat().st_mtime_ns)[: self._evicted]:
+            files = (item for item in entries if item.is_file())
+            for item in sorted(files, key=lambda item: item.stat().st_mtime_ns)[: self._evicted]:
                 Path(item.path).unlink(missing_ok=True)

@@ -84,11 +84,9 @@ def check(function: ca.Function) -> None:
     Raises:
         ValueError: there is no machine code for an operation.
     """
-    for i in range(function.n_instructions()):
-        operation = function.instruction_id(i)
-        if operation not in _SUPPORTED:
-            names = [name for name in dir(ca) if name.startswith("OP_") and getattr(ca, name) == operation]
-            raise ValueError(f"there is no machine code for CasADi's operation {' '.join(names)}")
+    for operation in set(map(function.instruction_id, range(function.n_instructions()))) - _SUPPORTED:
+        names = [name for name in dir(ca) if name.startswith("OP_") and getattr(ca, name) == operation]
+        raise ValueError(f"there is no machine code for CasADi's operation {' '.join(names)}")
 
 
 def write_ir(function: ca.Function, loop: RowLoop) -> str:

@@ -53,7 +53,12 @@ from reactorwatch.diagnosis.practical_significance import (
     residual_exceeds_tolerance,
     tolerances_of,
 )
-from reactorwatch.diagnosis.record_checks import describe_short_record, describe_still_inputs, make_run
+from reactorwatch.diagnosis.record_checks import (
+    describe_outliers,
+    describe_short_record,
+    describe_still_inputs,
+    make_run,
+)
 from reactorwatch.diagnosis.result import (
     AMBIGUOUS,
     LISTED,
@@ -137,7 +142,7 @@ def diagnose(
     found = _search_evidence(result, best, adequacy)
     verdict = decide_without_nuisance(found, None)
     location = best.hypothesis.filter.effects[0].location if best.label else ""
-    about_record = [*_describe_record(record), *_describe_outliers(whole, run)]
+    about_record = [*_describe_record(record), *describe_outliers(whole, run)]
     about_record += describe_still_inputs(model, effects, run.inputs)
     remarks = [*about_record]
     unknown: Localised | None = None
@@ -442,12 +447,3 @@ def _describe_record(record: Record) -> list[str]:
     shifts = ", ".join(f"{shift:+.4g}" for shift in record.run_shifts_min[1 : MAX_SPANS + 1])
     later = f"pictures and differences show those after the first {shifts} min later"
     return [f"{record.remarks[0]}; the state starts again in each, and {later}", *record.remarks[1:]]
-
-
-def _describe_outliers(whole: Run, run: Run) -> list[str]:
-    """Remark on outliers."""
-    count = whole.values - run.values
-    if count == 0:
-        return []
-    values = "1 value was" if count == 1 else f"{count} values were"
-    return [f"{values} excluded as outliers"]

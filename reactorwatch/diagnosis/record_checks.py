@@ -326,6 +326,20 @@ def describe_still_inputs(model: ProcessModel, effects: Sequence[Effect], inputs
     return [f"{levels} never moved, so these causes cannot be seen until it does: {', '.join(hidden)}"]
 
 
+def describe_outliers(whole: Run, run: Run) -> list[str]:
+    """Describe how many values were excluded as outliers; empty if none was.
+
+    Args:
+        whole: the record.
+        run: the record without its outliers.
+    """
+    count = whole.values - run.values
+    if count == 0:
+        return []
+    values = "1 value was" if count == 1 else f"{count} values were"
+    return [f"{values} excluded as outliers"]
+
+
 def describe_short_record(run: Run, nuisance: int) -> list[str]:
     """Describe that a record has fewer rows than the comparison with nuisance has parameters; empty if it has not."""
     rows = run.time_min.size

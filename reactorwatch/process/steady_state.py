@@ -12,7 +12,7 @@ is useful there.
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
-from math import inf, nan, nextafter
+from math import inf, nextafter
 from typing import Literal
 
 import casadi as ca
@@ -116,16 +116,14 @@ class SteadyStates:
     def _roots(self, inputs: Array, p: Array, time_min: float) -> list[Array]:
         """Distinct roots of the balances, without the states in `at_rest`."""
         fixed = (inputs, p, np.array([time_min]))
-        x, before = self._starts.copy(), np.full_like(self._starts, nan)
+        x = self._starts.copy()
         searching = np.arange(len(x))
-        for left in reversed(range(80)):  # what still moves then does not converge
-            now = x[searching]
-            after = self._search.map(now, *fixed)[0][:, :, 0]
-            # Most end in a cycle of two points that differ by rounding; which one it is after all steps is known then.
-            swings = np.all(after == before[searching], axis=1)
-            x[searching] = np.where(swings[:, None] & (left % 2 == 1), now, after)
-            before[searching] = now
-            searching = searching[np.any(after != now, axis=1) & ~swings]
+        for _ in range(20):  # what still moves then does not converge
+            now = after = x[searching]
+            for _ in range(4):  # most end in a cycle of two or four points that differ by rounding
+                after = self._search.map(after, *fixed)[0][:, :, 0]
+            x[searching] = after
+            searching = searching[np.any(after != now, axis=1)]
             if not searching.size:
                 break
         rate = self._search.map(x, *fixed)[1][:, :, 0]

@@ -346,8 +346,8 @@ def following(diagnosis: "Diagnosis") -> "Cause | None":
 
 
 def nearest_causes(diagnosis: "Diagnosis") -> list["Cause"]:
-    """Causes that remove part of the error that no cause explains, by that share."""
-    if diagnosis.verdict != "unknown":
+    """Causes that remove part of the error that neither a cause nor a law explains, by that share."""
+    if diagnosis.verdict != "unknown" or diagnosis.law is not None:
         return []
     return sorted((item for item in diagnosis.nearest if item.share >= 0.01), key=lambda item: -item.share)
 
