@@ -196,7 +196,9 @@ def with_nuisance(
         return structs.replace(
             exact, verdict=verdict.verdict, grade=verdict.grade, nearest=kept, onset=onset, causes=causes
         )
-    return _answer_with_nuisance(exact, explained, verdict, tuple(nearest), model, effects, record, uncertain)
+    found = _answer_with_nuisance(exact, explained, verdict, tuple(nearest), model, effects, record, uncertain)
+    # what the whole record differs by may be nuisance, so the cause is judged by its own effect
+    return structs.replace(found, practical=verdict.verdict != NOMINAL and graded[0].effect > 1.0)
 
 
 def _answer_with_nuisance(
@@ -243,7 +245,6 @@ def _answer_with_nuisance(
         locations=(),
         law=None,
         significant=not is_right,
-        practical=not is_right,
         gain=Gain(lead, held_out),
         experiment=None,
         extended_model=extended_model(adjusted, effects, causes, record.zero_ns),

@@ -291,7 +291,6 @@ WRONG: Sequence[str] = (
     "identify cstr.csv --compare --settle 3",
     "identify cstr.csv --model narx --recursive",
     "identify cstr.csv --order 0",
-    "diagnose cstr.csv --uncertain K3=0%",
     "simulate cstr.csv -o new.csv --fault coolant_flow:step:-2@5min",
 )
 
