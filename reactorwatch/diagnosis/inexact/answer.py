@@ -11,7 +11,7 @@ from reactorwatch.diagnosis.decide import Graded
 from reactorwatch.diagnosis.inexact.explain import Explained, Explanation
 from reactorwatch.diagnosis.inexact.hypotheses import CONSTANT, CURVE, RAMP, STEP
 from reactorwatch.diagnosis.result import Cause, Curves, Estimate, Nuisance, make_cause
-from reactorwatch.process.effect import ParameterEffect, ParameterShift
+from reactorwatch.process.effect import ParameterEffect, ParameterShift, SensorEffect
 from reactorwatch.process.model import ProcessModel
 
 WORTH = 2.0
@@ -42,7 +42,8 @@ def causes_of(item: Explanation, explained: Explained) -> list[Cause]:
         hypothesis, of_own = fitted.fitted.hypothesis, _own_factor(fitted, explained)
         parameters = {"size": Estimate(hypothesis.size / of_own, fitted.size_sd / of_own, effect.unit)}
         if hypothesis.kind in (STEP, RAMP):
-            parameters["onset"] = Estimate(hypothesis.onset, fitted.fitted.onset_sd, "min")
+            sd = float(np.hypot(fitted.fitted.onset_sd, _sensor_time_sd(fitted, explained)))
+            parameters["onset"] = Estimate(hypothesis.onset, sd, "min")
         if hypothesis.kind == RAMP:
             parameters["end"] = Estimate(float(explained.courses.time_min[-1]), 0.0, "min")
         if hypothesis.kind == CURVE:
@@ -52,6 +53,18 @@ def causes_of(item: Explanation, explained: Explained) -> list[Cause]:
         cause = make_cause(effect, hypothesis.kind, parameters)
         result.append(structs.replace(cause, share=item.share, probability=item.probability))
     return result
+
+
+def _sensor_time_sd(item: Explanation, explained: Explained) -> float:
+    """Standard deviation of the time at which a sensor's error set in, beyond that of the fit; 0 for other causes.
+
+    No row tells when between two of them it did, and it is stamped as early or late as all that the sensor shows.
+    """
+    if not isinstance(item.effect, SensorEffect):
+        return 0.0
+    nuisance = explained.nuisance
+    delay = nuisance.output_delays.start + nuisance.simulation.model.output_names.index(item.effect.output)
+    return float(np.hypot(explained.courses.period_min / 12.0**0.5, item.fitted.theta_sd[delay]))
 
 
 def _own_factor(item: Explanation, explained: Explained) -> float:

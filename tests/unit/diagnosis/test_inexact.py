@@ -203,6 +203,18 @@ def test_a_cause_is_named_in_a_record_that_is_not_quite_the_model(group: str, tm
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("output", ["T1", "T2"])
+def test_the_onset_of_a_sensors_error_is_not_known_better_than_to_a_row(output: str, tmp_path: Path) -> None:
+    records = (two_heaters.draw(7, number, False) for number in range(40))
+    drawn = next(item for item in records if item.cause is not None and f"{output}.bias" in item.cause.names)
+    assert drawn.cause is not None
+    path, process = write_files(drawn, tmp_path)
+    onset = diagnose(read_record(path, process=process)).causes[0].parameters["onset"]
+    assert onset.sd >= drawn.period_min / 12.0**0.5
+    assert onset.value == pytest.approx(drawn.cause.onset_min, abs=4.0 * onset.sd)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("group", ["skew", "lag", "constants"])
 def test_a_sound_plant_that_is_not_quite_its_model_is_called_right(group: str, tmp_path: Path) -> None:
     path, process = write_files(drawn_as(group, sound=True), tmp_path)
