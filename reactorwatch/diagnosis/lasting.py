@@ -245,11 +245,7 @@ class _SimulationFitter:
         start = self._evaluate(p)
         if not np.all(np.isfinite(start.evaluation.innovations.prediction[1:])):
             return None
-        return descend(start, self._solvable_equations, self._move, steps)
-
-    def _solvable_equations(self, point: _Point) -> Equations | None:
-        known = self._normal_equations(point)
-        return known if np.all(np.isfinite(known[0])) else None
+        return descend(start, self._normal_equations, self._move, steps)
 
     def _move(self, point: _Point, step: Array) -> _Point:
         return self._evaluate(np.clip(point.p + step, self._lower, self._upper))

@@ -38,7 +38,7 @@ def descend(
 
     Args:
         start: first point.
-        equations: normal equations at a point; None: they cannot be solved, and the descent ends.
+        equations: normal equations at a point; None, or not finite: the descent ends there.
         move: the point after a step, shortened where it would leave the trust region or a bound; None: the model
             diverges there.
         steps: maximum number of steps.
@@ -47,7 +47,7 @@ def descend(
     best, damping = start, _DAMPING
     for _ in range(steps):
         known = equations(best)
-        if known is None:
+        if known is None or not np.all(np.isfinite(known[0])):
             break
         information, gradient = known
         scale = np.sqrt(np.maximum(np.diag(information), 1e-300))

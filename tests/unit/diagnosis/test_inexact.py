@@ -2,6 +2,7 @@
 
 from functools import lru_cache
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from benchmarks.inexact import two_heaters
 from benchmarks.inexact.records import Drawn, write_files
 from reactorwatch.api.diagnosis import diagnose
 from reactorwatch.api.records import read_record
+from reactorwatch.diagnosis.fitting.descent import Equations, descend
 from reactorwatch.diagnosis.fitting.profiles import Signal
 from reactorwatch.diagnosis.inexact.explain import explain
 from reactorwatch.diagnosis.inexact.hypotheses import CONSTANT, STEP, WIDTH, Courses
@@ -164,6 +166,16 @@ def test_a_stated_sd_is_the_prior_of_its_parameter_and_none_is_exact() -> None:
     for stated, expected in ((0.05 * value, 0.05), (0.0, 1e-3 * abs(effect.typical))):
         other = Nuisance(nuisance.simulation, start.x[:1], {effect.parameter: stated})  # type: ignore[attr-defined]
         assert other.sds(Prior(1.0, 1.0, False))[index] == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("known", [np.nan, np.inf, None])
+def test_a_descent_ends_where_its_equations_cannot_be_solved(known: float | None) -> None:
+    start = SimpleNamespace(loss=1.0)
+
+    def equations(point: SimpleNamespace) -> Equations | None:
+        return None if known is None else (np.array([[known, 0.0], [0.0, 1.0]]), np.ones(2))
+
+    assert descend(start, equations, lambda point, step: None, 5) is start
 
 
 def test_without_effects_there_is_no_explanation() -> None:
