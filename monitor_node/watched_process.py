@@ -22,7 +22,8 @@ from monitor_node.config import (
 )
 from reactorwatch.description.process import Process, Signal
 from reactorwatch.description.read import find_process
-from reactorwatch.errors import InputError, describe_unknown
+from reactorwatch.diagnosis.parameter_priors import check_priors
+from reactorwatch.errors import InputError, describe_unknown, prefix_errors
 from reactorwatch.process.model import ProcessModel, Variable
 from reactorwatch.units import conversion
 
@@ -83,10 +84,9 @@ def watch_process(config: MonitorConfig, process: Process, rows: int | None = No
     for key, watched in (("bounds", names), ("resolution", changed["outputs"])):
         values = described[key] | stated[key]
         changed[key] = {name: value for name, value in values.items() if name in watched}
-    known = () if process.model is None else tuple(item.name for item in process.model.parameters)
-    for parameter in config.uncertain:
-        if parameter not in known:
-            raise InputError(f"settings [monitor] uncertain: {describe_unknown('parameter', parameter, known)}")
+    if config.uncertain:
+        with prefix_errors("settings [monitor]"):
+            check_priors(process.require_model(), config.uncertain)
     changed["uncertain"] = process.uncertain | config.uncertain
     if process.model is None:
         changed["process"] = WITHOUT_EQUATIONS

@@ -58,6 +58,12 @@ def parse_priors(text: str, model: ProcessModel) -> dict[str, float]:
     return result
 
 
+def check_priors(model: ProcessModel, sds: Mapping[str, float]) -> None:
+    """Check priors: arguments and errors as for `add_priors`."""
+    for name, sd in sds.items():
+        _check_sd(_find_parameter(name, model), sd)
+
+
 def add_priors(model: ProcessModel, sds: Mapping[str, float]) -> ProcessModel:
     """Add offsets of parameters to the model as constant states.
 
@@ -68,11 +74,9 @@ def add_priors(model: ProcessModel, sds: Mapping[str, float]) -> ProcessModel:
     Raises:
         InputError: there is no such parameter, or its standard deviation is negative or larger than its value.
     """
-    for name, sd in sds.items():
-        item = _find_parameter(name, model)
-        _check_sd(item, sd)
-        if not sd:
-            continue
+    check_priors(model, sds)
+    for name in (name for name, sd in sds.items() if sd):
+        item, sd = model.parameter(name), sds[name]
         bounds = (item.lower - item.value, item.upper - item.value)
         off = variable(f"{name}{_OFF}", item.unit, bounds, sd, f"offset of {name}")
         begin = parameter(f"{name}{_BEGIN}", 0.0, item.unit, bounds, f"initial offset of {name}")

@@ -27,6 +27,7 @@ from reactorwatch.contract.codec import Encoded, Publication, decode, encode
 from reactorwatch.contract.messages_pb2 import Baseline, Incident, Promise
 from reactorwatch.description.read import find_process
 from reactorwatch.diagnosis.report import panels
+from reactorwatch.errors import InputError
 from reactorwatch.records.record import Record
 from reactorwatch.runtime.jobs import ProcessExecutor, SerialExecutor
 from recorder.tools.player import samples_of
@@ -79,6 +80,20 @@ def test_a_training_adjusts_the_parameters_that_the_process_calls_uncertain(fold
     (adjusted,) = re.findall(r"agrees with the equations; k is (\S+) 1/min", found.baseline.why)
     assert float(adjusted) == pytest.approx(0.03, rel=0.02)
     assert not found.alarms
+
+
+@pytest.mark.parametrize(
+    ("uncertain", "expected"),
+    [
+        ({"zz": 1.0}, r"settings \[monitor\]: uncertain must be of .*, got zz"),
+        ({"k": 1.0}, "k must be at most its value"),
+    ],
+)
+def test_what_the_settings_call_uncertain_is_checked_at_the_start(
+    folder: Path, uncertain: dict[str, float], expected: str
+) -> None:
+    with pytest.raises(InputError, match=expected):
+        load_process(MonitorConfig(process=str(folder / "plain.py"), uncertain=uncertain))
 
 
 @pytest.mark.parametrize(
