@@ -1,4 +1,4 @@
-"""What is known of a record before it is explained."""
+"""The problem of a diagnosis: a record, its model, the catalogue, priors and tolerances."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ from reactorwatch.records.record import Record
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """A record to be explained, and what is known of its plant.
+    """A record to be explained, with its model, catalogue, priors and tolerances.
 
     Attributes:
         record: the record.
