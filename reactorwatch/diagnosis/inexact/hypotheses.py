@@ -101,7 +101,8 @@ class Courses:
         """Derivative of a course by its onset; a sensor's step jumps, so its derivative is that over a row."""
         half = 0.5 * self.period_min
         ahead, behind = self.course(kind, onset + half), self.course(kind, onset - half)
-        return Signal(*((a - b) / self.period_min for a, b in zip(ahead[:2], behind[:2], strict=True)))
+        mean, value = ahead.interval_mean - behind.interval_mean, ahead.sample_value - behind.sample_value
+        return Signal(mean / self.period_min, value / self.period_min)
 
     def hats(self) -> Signal:
         """Functions that are 1 at a knot and 0 at the others, shape (rows, KNOTS)."""
