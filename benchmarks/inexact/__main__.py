@@ -65,7 +65,7 @@ def watch_record(job: Job) -> dict[str, Any]:
 
 
 def _run_on(drawn: Drawn, command: str, *options: str) -> dict[str, Any]:
-    """What a command prints of a record."""
+    """Write a record and its process, and read a command's JSON."""
     with tempfile.TemporaryDirectory() as folder:
         path, process = write_files(drawn, Path(folder))
         found: dict[str, Any] = json.loads(run(command, str(path), "--process", process, *options, "--json"))
