@@ -51,9 +51,6 @@ class CompiledFunction:
         shared: indices of the arguments that are the same for all rows.
         chained: number of leading arguments that are the leading results of the row before.
         stops: whether a chained function stops after a row whose very last number is not above zero.
-
-    Raises:
-        ValueError: the function has an operation that there is no machine code for.
     """
 
     def __init__(
@@ -62,7 +59,6 @@ class CompiledFunction:
         symbols = function.sx_in()
         results = [ca.densify(item) for item in function.call(symbols)]
         self._function = ca.Function(function.name(), symbols, results)
-        check(self._function)
         kinds = (CHAINED if i < chained else SHARED if i in shared else PER_ROW for i in range(len(symbols)))
         self._shapes = [item.shape for item in results]
         counts = tuple(item.numel() for item in results)
@@ -139,7 +135,11 @@ class CompiledFunction:
             _check_array(array, rows * count)
 
     def prepare(self) -> None:
-        """Compile now instead of at the first use."""
+        """Compile now instead of at the first use.
+
+        Raises:
+            ValueError: the function has an operation that there is no machine code for.
+        """
         _ = self._scalar_call
         if not self._loop.chained:
             _ = self._vector_call
@@ -202,6 +202,7 @@ class _Host:
         def compile_now() -> bytes:
             self._compiled += 1
             report_stage("compiling function", self._compiled)
+            check(function)
             return bytes(machine.emit_object(llvm.parse_assembly(write_ir(function, loop))))
 
         stored = self._cache.get_or_make(name, compile_now)

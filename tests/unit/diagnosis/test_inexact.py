@@ -67,7 +67,7 @@ def test_the_derivatives_by_all_nuisance_are_differences_of_simulations(late: fl
     simulated = nuisance.simulate(theta)
     assert simulated is not None
     found = nuisance.linearise(theta, simulated)
-    sizes = np.maximum(np.max(np.abs(found.nuisance), axis=(0, 1)), 1e-9)
+    sizes = np.maximum(np.max(np.abs(found.derivatives), axis=(0, 1)), 1e-9)
     for index in range(nuisance.moves.start):
         step = 1e-4 * nuisance.sds(Prior(1.0, 1.0, False))[index]
         moved = theta.copy()
@@ -76,7 +76,7 @@ def test_the_derivatives_by_all_nuisance_are_differences_of_simulations(late: fl
         assert other is not None
         difference = (nuisance.read(other, moved) - found.read) / step
         # an input that is held has a kink at each move, so the derivative by its delay is that of one side
-        assert np.max(np.abs(difference - found.nuisance[:, :, index])) < 0.1 * sizes[index], nuisance.names[index]
+        assert np.max(np.abs(difference - found.derivatives[:, :, index])) < 0.1 * sizes[index], nuisance.names[index]
 
 
 def test_the_derivatives_by_a_step_of_every_effect_are_differences_of_simulations() -> None:
