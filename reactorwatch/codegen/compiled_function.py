@@ -56,13 +56,11 @@ class CompiledFunction:
     def __init__(
         self, function: ca.Function, shared: Sequence[int] = (), chained: int = 0, *, stops: bool = False
     ) -> None:
-        symbols = function.sx_in()
-        results = [ca.densify(item) for item in function.call(symbols)]
-        self._function = ca.Function(function.name(), symbols, results)
-        kinds = (CHAINED if i < chained else SHARED if i in shared else PER_ROW for i in range(len(symbols)))
-        self._shapes = [item.shape for item in results]
-        counts = tuple(item.numel() for item in results)
-        self._loop = RowLoop(tuple(kinds), tuple(item.numel() for item in symbols), counts, stops)
+        self._function = _make_dense(function, function.sx_in())
+        kinds = (CHAINED if i < chained else SHARED if i in shared else PER_ROW for i in range(function.n_in()))
+        self._shapes = [function.size_out(i) for i in range(function.n_out())]
+        sizes, counts = map(function.numel_in, range(function.n_in())), map(function.numel_out, range(function.n_out()))
+        self._loop = RowLoop(tuple(kinds), tuple(sizes), tuple(counts), stops)
         self._engines: list[llvm.ExecutionEngine] = []  # they own the code
 
     def allocate_results(self, rows: int) -> list[Array]:
@@ -169,6 +167,13 @@ class CompiledFunction:
         return call
 
 
+def _make_dense(function: ca.Function, symbols: Sequence[Any]) -> ca.Function:
+    """The function of these symbols with dense results; of a large one to make another takes as long as to load it."""
+    if all(function.sparsity_out(index).is_dense() for index in range(function.n_out())):
+        return function
+    return ca.Function(function.name(), symbols, [ca.densify(item) for item in function.call(symbols)])
+
+
 def _address(call: _Call) -> int:
     return int(ctypes.cast(cast(Any, call), ctypes.c_void_p).value or 0)
 
@@ -233,9 +238,7 @@ class ArrayFunction:
     """
 
     def __init__(self, function: ca.Function) -> None:
-        symbols = function.mx_in()
-        if not all(function.sparsity_out(index).is_dense() for index in range(function.n_out())):
-            function = ca.Function(function.name(), symbols, [ca.densify(item) for item in function.call(symbols)])
+        function = _make_dense(function, function.mx_in())
         self.arguments: tuple[Array, ...] = tuple(
             np.zeros(function.size_in(index)[::-1]) for index in range(function.n_in())
         )
