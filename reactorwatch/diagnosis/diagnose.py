@@ -87,6 +87,8 @@ from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.profiles import CONSTANT, FREE_NAME
 from reactorwatch.process.signal_effects import InputDelay, InputLag, OutputDelay, OutputLag
 from reactorwatch.records.record import MAX_SPANS, Record
+from reactorwatch.sentences.diagnosis import describe_place
+from reactorwatch.sentences.numbers import odds
 
 KEPT_BYTES = 31_000_000
 
@@ -156,7 +158,7 @@ def diagnose(
             if not by_source:
                 location = unknown.location
         elif unknown.gain_over(best) > -SURE and len(best.label) > 1:
-            remarks.append(f"one unknown deviation in {unknown.location} explains the record as well")
+            remarks.append(f"one unknown deviation {describe_place(unknown.location)} explains the record as well")
         else:
             unknown = None
         if unknown is None and np.any(adequacy >= WHITE):
@@ -179,9 +181,8 @@ def diagnose(
     else:
         reported, best = law_hypothesis(law, run, model, uncertain)
         if unknown is not None and unknown.approximation > LISTED:
-            remarks.append(
-                f"the law is an approximation: a smooth correction there is better by {unknown.approximation:.0f} BIC"
-            )
+            better = odds(unknown.approximation)
+            remarks.append(f"the law is an approximation: a smooth correction there is better by odds of {better}")
         covariances, adequacy = covariances_of(run, best), minus_log10_p(best.fit.w, run.inputs)
     before, after = evaluate_holdout(run, result.nominal, best)
     curves = curves_of(whole, run, model, result.nominal, best, covariances)
@@ -258,7 +259,7 @@ def diagnose(
         experiment=experiment,
         extended_model=extended_model(adjusted, effects, causes, record.zero_ns, reported),
         parameters=parameters,
-        differences=differences_of(model, noise_sd, curves),
+        differences=differences_of(model, noise_sd, curves, bands),
         remarks=tuple(remarks),
         curves=curves,
     )
