@@ -273,6 +273,7 @@ class CodeCache:
 
     def __init__(self, folder: Path, capacity: int = 4000, evicted: int = 1000) -> None:
         self._folder, self._capacity, self._evicted = folder, capacity, evicted
+        self._room = 0  # entries that may be stored before the folder is counted again
 
     def get_or_make(self, name: str, make: Callable[[], bytes]) -> bytes:
         """Return the entry of a name; make and store it if it is missing or damaged.
@@ -308,8 +309,12 @@ class CodeCache:
                 temporary.unlink()
 
     def _evict(self) -> None:
+        self._room -= 1
+        if self._room >= 0:
+            return
         entries = list(os.scandir(self._folder))
-        if len(entries) > self._capacity:
+        self._room = self._capacity - len(entries)
+        if self._room < 0:
             files = (item for item in entries if item.is_file())
             for item in sorted(files, key=lambda item: item.stat().st_mtime_ns)[: self._evicted]:
                 Path(item.path).unlink(missing_ok=True)
