@@ -227,6 +227,7 @@ def _answer_with_nuisance(
         nearest=nearest,
         onset=answer.onset_of(causes),
         nuisance=answer.nuisance_of(best, explained),
+        relative_delays=answer.relative_delays(best, explained),
         remaining=remaining_of(held_out, None),
         location=causes[0].location if causes else None,
         locations=(),

@@ -60,6 +60,7 @@ from reactorwatch.diagnosis.whiteness import looks_like_integration, minus_log10
 from reactorwatch.process.effect import TIMING
 from reactorwatch.process.law import ExtendedLaw
 from reactorwatch.process.model import ProcessModel
+from reactorwatch.sentences.numbers import odds
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,7 +175,7 @@ def answer_exactly(exact: Exact, problem: Problem, about_record: Sequence[str]) 
         experiment=experiment,
         extended_model=extended_model(adjusted, effects, causes, record.zero_ns, estimated.law),
         parameters=parameters,
-        differences=differences_of(model, noise_sd, curves),
+        differences=differences_of(model, noise_sd, curves, bands),
         remarks=tuple(remarks),
         curves=curves,
     )
@@ -189,8 +190,8 @@ def _estimate(exact: Exact, problem: Problem) -> _Estimated:
     law, best = law_hypothesis(exact.law, run, problem.model, problem.uncertain)
     assert exact.unknown is not None  # whose law it is
     if exact.unknown.approximation > LISTED:
-        worse = exact.unknown.approximation
-        remarks.append(f"the law is an approximation: a smooth correction there is better by {worse:.0f} BIC")
+        worse = odds(exact.unknown.approximation)
+        remarks.append(f"the law is an approximation: a smooth correction there is better by odds of {worse}")
     adequacy = minus_log10_p(best.fit.w, run.inputs)
     return _Estimated(best, covariances_of(run, best), adequacy, law, tuple(remarks))
 

@@ -23,6 +23,7 @@ from reactorwatch.process.effect import Effect
 from reactorwatch.process.generic import hidden_sources
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.profiles import CONSTANT, FREE_NAME
+from reactorwatch.sentences.diagnosis import describe_place
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +107,7 @@ def _with_unknown(exact: Exact, unknowns: UnknownSearch, model: ProcessModel) ->
     if verdict == UNKNOWN:
         best, location = result.nominal, location if by_source else unknown.location
     elif unknown.gain_over(best) > -SURE and len(best.label) > 1:
-        remarks.append(f"one unknown deviation in {unknown.location} explains the record as well")
+        remarks.append(f"one unknown deviation {describe_place(unknown.location)} explains the record as well")
     else:
         kept = None
     if kept is None and np.any(exact.adequacy >= WHITE):
