@@ -40,16 +40,13 @@ def draw_record(job: Job) -> Drawn:
 
 def diagnose_record(job: Job) -> dict[str, Any]:
     """Draw a record, diagnose it by the command, and score what it prints."""
-    drawn = draw_record(job)
-    with tempfile.TemporaryDirectory() as folder:
-        path, process = write_files(drawn, Path(folder))
-        before_s = _children_s()
-        try:
-            result = score(drawn.truth, json.loads(run("diagnose", str(path), "--process", process, "--json")))
-        except InputError as error:
-            nothing = {"verdict": "error", "causes": [], "alternatives": [], "practical": False}
-            result = score(drawn.truth, nothing) | {"error": str(error)}
-    return {"truth": drawn.truth, "score": result, "cpu_s": round(_children_s() - before_s, 2)}
+    drawn, before_s = draw_record(job), _children_s()
+    try:
+        result = score(drawn.truth, _run_on(drawn, "diagnose"))
+    except InputError as error:
+        nothing = {"verdict": "error", "causes": [], "alternatives": [], "practical": False}
+        result = score(drawn.truth, nothing) | {"error": str(error)}
+    return _line(drawn, result, before_s)
 
 
 def watch_record(job: Job) -> dict[str, Any]:
@@ -57,18 +54,26 @@ def watch_record(job: Job) -> dict[str, Any]:
 
     The first third of the whole record is the training, as without an option.
     """
-    drawn = draw_record(job)
+    drawn, before_s = draw_record(job), _children_s()
     assert drawn.cause is not None
     assert drawn.cause.onset_min is not None
     rows = len(next(iter(drawn.columns.values())))
     until = min(int((drawn.cause.onset_min + AFTER_MIN) / drawn.period_min) + 1, rows)
     shorter = drawn._replace(columns={name: values[:until] for name, values in drawn.columns.items()})
+    alarms = _run_on(shorter, "backtest", "--training-rows", str(rows // 3))["alarms"]
+    return _line(drawn, score_suspects(drawn.truth, alarms[-1]["suspect"] if alarms else []), before_s)
+
+
+def _run_on(drawn: Drawn, command: str, *options: str) -> dict[str, Any]:
+    """Write a record and its process, and read a command's JSON."""
     with tempfile.TemporaryDirectory() as folder:
-        path, process = write_files(shorter, Path(folder))
-        before_s = _children_s()
-        found = run("backtest", str(path), "--process", process, "--training-rows", str(rows // 3), "--json")
-    alarms = json.loads(found)["alarms"]
-    result = score_suspects(drawn.truth, alarms[-1]["suspect"] if alarms else [])
+        path, process = write_files(drawn, Path(folder))
+        found: dict[str, Any] = json.loads(run(command, str(path), "--process", process, *options, "--json"))
+    return found
+
+
+def _line(drawn: Drawn, result: dict[str, Any], before_s: float) -> dict[str, Any]:
+    """A record's line of the results, with the CPU time of its command."""
     return {"truth": drawn.truth, "score": result, "cpu_s": round(_children_s() - before_s, 2)}
 
 

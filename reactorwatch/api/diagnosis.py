@@ -26,6 +26,7 @@ from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import Record
 from reactorwatch.sentences.diagnosis import (
     describe_causes,
+    describe_place,
     describe_rival,
     describe_size,
     describe_timing,
@@ -83,8 +84,14 @@ class DiagnosisResult(Shown[Diagnosis]):
 
     def _repr_html_(self) -> str:
         causes = [
-            (cause.label, cause.cause, cause.location, describe_size(cause, self.effects), describe_timing(cause))
-            for cause in self.causes
+            (
+                item.label,
+                item.cause,
+                describe_place(item.location),
+                describe_size(item, self.effects),
+                describe_timing(item),
+            )
+            for item in self.causes
         ]
         others = [
             (describe_causes(item.causes, self.effects), describe_rival(item, self.result))

@@ -34,6 +34,7 @@ from reactorwatch.records.decode import is_table
 from reactorwatch.records.record import Record, to_time_ns
 from reactorwatch.records.write import atomic_write, check_output_folder, fill_folder, write_table
 from reactorwatch.sentences.diagnosis import diagnosis_text
+from reactorwatch.sentences.numbers import percent
 from recorder.panels.base import ALARM, INPUT, LIMIT, MEASURED, PREDICTED, Colour, Series, TimePlot
 
 PAGE, OBJECT, MODEL, DRAWING = "report.html", "report.json", "extended.json", "report.rrd"
@@ -159,12 +160,17 @@ def _text(job: Job[DiagnosisOptions], found: DiagnosisResult, *, has_report: boo
     return f"{text}\n  report      {job.folder / PAGE}"
 
 
-_COLUMNS = ("samples", "span_min", "seconds", "verdict", "causes", "location", "significant", "practical", "delta_bic")
+_COLUMNS = (
+    *("samples", "span_min", "seconds", "verdict", "causes", "location", "significant", "practical", "delta_bic"),
+    *("share", "probability"),  # of the causes
+)
 
 
 def _row(found: Diagnosis) -> Row:
     row = found.to_dict()
-    row |= {"causes": " + ".join(map(_fault_text, found.causes)), "delta_bic": row["gain"]["delta_bic"]}
+    first = row["causes"][0] if row["causes"] else {}
+    row |= {"delta_bic": row["gain"]["delta_bic"], "share": first.get("share"), "probability": first.get("probability")}
+    row |= {"causes": " + ".join(map(_fault_text, found.causes))}
     return {"file": found.file, "watched": True} | {name: row[name] for name in _COLUMNS}
 
 
@@ -199,7 +205,8 @@ def _summary(rows: Sequence[Row]) -> str:
             "verdict": row["verdict"] or ("failed" if row["watched"] is None else "not diagnosed"),
             "causes": row["causes"] or "",
             "matters": "yes" if row["practical"] else "",
-            "delta BIC": "" if row["delta_bic"] is None else f"{row['delta_bic']:,.0f}",
+            "removes": "" if row["share"] is None else percent(row["share"]),
+            "likely": "" if row["probability"] is None else percent(row["probability"]),
             "location": row["location"] or "",
         }
         for row in rows
@@ -228,10 +235,11 @@ def _plots(diagnosis: Diagnosis, curves: Curves, model: ProcessModel, time_ns: N
     def line(label: str, values: Array, colour: Colour, legend: str = "", width: float = 1.0) -> Series:
         return Series(label, time_ns, values, colour, width=width, legend=legend)
 
+    more = "extended" if diagnosis.is_extended or not diagnosis.with_nuisance else "with small corrections"
     for item in model.outputs:
         measured = line("measured", curves.measured[item.name], MEASURED, width=2.5)
         before = line("simulation as it was", curves.simulated_before[item.name], ALARM)
-        after = line("simulation extended", curves.simulated_after[item.name], PREDICTED)
+        after = line(f"simulation {more}", curves.simulated_after[item.name], PREDICTED)
         yield TimePlot(item.name, item.unit, (measured, before, after))
     ends = np.full(time_ns.size, SD_95)
     for item in model.outputs:
@@ -239,7 +247,7 @@ def _plots(diagnosis: Diagnosis, curves: Curves, model: ProcessModel, time_ns: N
             line(f"{end} limit", sign * ends, LIMIT, "95 % of noise") for end, sign in (("upper", 1), ("lower", -1))
         )
         before = line("as it was", curves.residual_before[item.name], ALARM)
-        after = line("extended", curves.residual_after[item.name], PREDICTED)
+        after = line(more, curves.residual_after[item.name], PREDICTED)
         yield TimePlot(f"Residual of {item.name}", "standard deviations", (*limits, before, after))
     for cause in diagnosis.causes:
         lower, upper = interval(cause, curves)

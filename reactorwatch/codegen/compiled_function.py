@@ -51,22 +51,16 @@ class CompiledFunction:
         shared: indices of the arguments that are the same for all rows.
         chained: number of leading arguments that are the leading results of the row before.
         stops: whether a chained function stops after a row whose very last number is not above zero.
-
-    Raises:
-        ValueError: the function has an operation that there is no machine code for.
     """
 
     def __init__(
         self, function: ca.Function, shared: Sequence[int] = (), chained: int = 0, *, stops: bool = False
     ) -> None:
-        symbols = function.sx_in()
-        results = [ca.densify(item) for item in function.call(symbols)]
-        self._function = ca.Function(function.name(), symbols, results)
-        check(self._function)
-        kinds = (CHAINED if i < chained else SHARED if i in shared else PER_ROW for i in range(len(symbols)))
-        self._shapes = [item.shape for item in results]
-        counts = tuple(item.numel() for item in results)
-        self._loop = RowLoop(tuple(kinds), tuple(item.numel() for item in symbols), counts, stops)
+        self._function = _make_dense(function, function.sx_in())
+        kinds = (CHAINED if i < chained else SHARED if i in shared else PER_ROW for i in range(function.n_in()))
+        self._shapes = [function.size_out(i) for i in range(function.n_out())]
+        sizes, counts = map(function.numel_in, range(function.n_in())), map(function.numel_out, range(function.n_out()))
+        self._loop = RowLoop(tuple(kinds), tuple(sizes), tuple(counts), stops)
         self._engines: list[llvm.ExecutionEngine] = []  # they own the code
 
     def allocate_results(self, rows: int) -> list[Array]:
@@ -139,7 +133,11 @@ class CompiledFunction:
             _check_array(array, rows * count)
 
     def prepare(self) -> None:
-        """Compile now instead of at the first use."""
+        """Compile now instead of at the first use.
+
+        Raises:
+            ValueError: the function has an operation that there is no machine code for.
+        """
         _ = self._scalar_call
         if not self._loop.chained:
             _ = self._vector_call
@@ -167,6 +165,13 @@ class CompiledFunction:
         pointers = [ctypes.c_void_p] * (loop.chains * (len(loop.sizes) + len(loop.counts)))
         call: _Call = ctypes.CFUNCTYPE(ctypes.c_int64, ctypes.c_int64, *pointers)(engine.get_function_address("rows"))
         return call
+
+
+def _make_dense(function: ca.Function, symbols: Sequence[Any]) -> ca.Function:
+    """The function of these symbols with dense results; of a large one to make another takes as long as to load it."""
+    if all(function.sparsity_out(index).is_dense() for index in range(function.n_out())):
+        return function
+    return ca.Function(function.name(), symbols, [ca.densify(item) for item in function.call(symbols)])
 
 
 def _address(call: _Call) -> int:
@@ -202,6 +207,7 @@ class _Host:
         def compile_now() -> bytes:
             self._compiled += 1
             report_stage("compiling function", self._compiled)
+            check(function)
             return bytes(machine.emit_object(llvm.parse_assembly(write_ir(function, loop))))
 
         stored = self._cache.get_or_make(name, compile_now)
@@ -232,9 +238,7 @@ class ArrayFunction:
     """
 
     def __init__(self, function: ca.Function) -> None:
-        symbols = function.mx_in()
-        if not all(function.sparsity_out(index).is_dense() for index in range(function.n_out())):
-            function = ca.Function(function.name(), symbols, [ca.densify(item) for item in function.call(symbols)])
+        function = _make_dense(function, function.mx_in())
         self.arguments: tuple[Array, ...] = tuple(
             np.zeros(function.size_in(index)[::-1]) for index in range(function.n_in())
         )
@@ -273,6 +277,7 @@ class CodeCache:
 
     def __init__(self, folder: Path, capacity: int = 4000, evicted: int = 1000) -> None:
         self._folder, self._capacity, self._evicted = folder, capacity, evicted
+        self._room = 0  # entries that may be stored before the folder is counted again
 
     def get_or_make(self, name: str, make: Callable[[], bytes]) -> bytes:
         """Return the entry of a name; make and store it if it is missing or damaged.
@@ -308,8 +313,12 @@ class CodeCache:
                 temporary.unlink()
 
     def _evict(self) -> None:
+        self._room -= 1
+        if self._room >= 0:
+            return
         entries = list(os.scandir(self._folder))
-        if len(entries) > self._capacity:
+        self._room = self._capacity - len(entries)
+        if self._room < 0:
             files = (item for item in entries if item.is_file())
             for item in sorted(files, key=lambda item: item.stat().st_mtime_ns)[: self._evicted]:
                 Path(item.path).unlink(missing_ok=True)

@@ -49,6 +49,7 @@ class Difference(Result, frozen=True):
         unit: unit of the errors.
         along: ranges by axis: time in min, then inputs and outputs in their units; empty if the simulation diverged.
         units: units of the axes.
+        tolerance: error beyond the noise that does not matter in practice.
     """
 
     rmse: float
@@ -58,8 +59,14 @@ class Difference(Result, frozen=True):
     unit: str
     along: dict[str, tuple[Range, ...]]
     units: dict[str, str]
+    tolerance: float
 
-    python_only: ClassVar = ("units",)
+    python_only: ClassVar = ("units", "tolerance")
+
+    @property
+    def matters(self) -> bool:
+        """True if the error beyond the noise exceeds the tolerance, or is unknown."""
+        return not self.rmse**2 - self.noise_sd**2 <= self.tolerance**2
 
     def worst(self, axis: str) -> Range | None:
         """Range of an axis with the largest error; None if it has none."""
@@ -73,6 +80,7 @@ def compute_difference(
     unit: str,
     time_min: Array,
     signals: Mapping[str, tuple[Array, str]],
+    tolerance: float,
 ) -> Difference:
     """Difference in one output.
 
@@ -83,6 +91,7 @@ def compute_difference(
         unit: unit of the output.
         time_min: shape (rows,).
         signals: inputs and simulated outputs by name: values of shape (rows,), and their unit.
+        tolerance: error beyond the noise that does not matter in practice.
     """
     edges = np.linspace(time_min[0], time_min[-1], BINS + 1)
     along, units = {TIME: _ranges(error, time_min, edges)}, {TIME: "min"}
@@ -92,7 +101,7 @@ def compute_difference(
         along[name] = _ranges(error, values, np.unique(np.quantile(finite, shares))) if finite.size else ()
     rmse = _rms(error)
     noise_share = min((noise_sd / rmse) ** 2, 1.0) if rmse > 0.0 else 1.0
-    return Difference(rmse, noise_sd, noise_share, _rms(innovations), unit, along, units)
+    return Difference(rmse, noise_sd, noise_share, _rms(innovations), unit, along, units, tolerance)
 
 
 def _ranges(error: Array, values: Array, edges: Array) -> tuple[Range, ...]:

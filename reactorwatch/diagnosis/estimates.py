@@ -269,14 +269,12 @@ def adjusted_parameters(
 
 
 def convert_to_run_minutes(causes: Sequence[Cause], record: Record) -> tuple[Cause, ...]:
-    """Convert the times of causes to minutes of the run in which they set in.
+    """Convert the times of causes to minutes of the run in which they set in, and mark those from its beginning.
 
     Args:
         causes: causes with times that increase over all runs (`Record.continuous_min`).
         record: record that they explain.
     """
-    if len(record.run_starts) == 1:
-        return tuple(causes)
     starts_min = record.continuous_min[list(record.run_starts)]
     result = []
     for cause in causes:
@@ -284,6 +282,12 @@ def convert_to_run_minutes(causes: Sequence[Cause], record: Record) -> tuple[Cau
         times.discard("time_constant")
         first_min = min((cause.parameters[name].value for name in times), default=-inf)
         run = max(int(np.searchsorted(starts_min, first_min, side="right")), 1)
+        if (onset := cause.parameters.get("onset")) is not None:
+            begins = bool(onset.value - starts_min[run - 1] <= 2.0 * onset.sd)
+            cause = structs.replace(cause, from_beginning=begins)
+        if len(record.run_starts) == 1:
+            result.append(cause)
+            continue
         shift_min = record.run_shifts_min[run - 1]
         parameters = {
             name: structs.replace(item, value=item.value - shift_min) if name in times else item

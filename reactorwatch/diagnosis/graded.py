@@ -15,6 +15,7 @@ from reactorwatch.diagnosis.estimates import (
 from reactorwatch.diagnosis.holdout import Errors, excess, rms, share_of, simulate_outputs
 from reactorwatch.diagnosis.inexact import answer
 from reactorwatch.diagnosis.inexact.explain import Explained, Explanation
+from reactorwatch.diagnosis.problem import Problem
 from reactorwatch.diagnosis.result import (
     AMBIGUOUS,
     LISTED,
@@ -161,30 +162,18 @@ def separate_corrections(
     return kept, tuple(Nuisance(item.cause, item.parameters["size"], None) for item in small)
 
 
-def with_nuisance(
-    exact: Diagnosis,
-    explained: Explained,
-    model: ProcessModel,
-    effects: Sequence[Effect],
-    record: Record,
-    tolerances: Mapping[str, float],
-    uncertain: Mapping[str, float],
-) -> Diagnosis:
+def with_nuisance(exact: Diagnosis, explained: Explained, problem: Problem) -> Diagnosis:
     """A diagnosis with the explanations with nuisance in the place of those without, if these say more.
 
     Args:
         exact: diagnosis without nuisance.
         explained: explanations with nuisance.
-        model: process model of the simulation.
-        effects: effects that may be named.
-        record: the record.
-        tolerances: tolerance of each output, by name.
-        uncertain: standard deviations of parameters.
+        problem: the record and what is known of its plant.
     """
-    bands = np.array([tolerances[name] for name in model.output_names])
+    bands, record = problem.bands, problem.record
     graded = [answer.grades(item, explained, bands) for item in explained.explanations]
     first = exact.nearest[0].share if exact.causes and exact.nearest else 0.0
-    left = left_in_tolerances(exact.gain.held_out, tolerances)
+    left = left_in_tolerances(exact.gain.held_out, problem.tolerances)
     none = answer.grades(explained.none, explained, bands)
     verdict = decide(exact.verdict, first, left, none, graded, is_law=exact.law is not None)
     nearest = [cause for item in explained.explanations for cause in answer.causes_of(item, explained)[:1]]
@@ -196,7 +185,7 @@ def with_nuisance(
         return structs.replace(
             exact, verdict=verdict.verdict, grade=verdict.grade, nearest=kept, onset=onset, causes=causes
         )
-    found = _answer_with_nuisance(exact, explained, verdict, tuple(nearest), model, effects, record, uncertain)
+    found = _answer_with_nuisance(exact, explained, verdict, tuple(nearest), problem)
     # what the whole record differs by may be nuisance, so the cause is judged by its own effect
     return structs.replace(found, practical=verdict.verdict != NOMINAL and graded[0].effect > 1.0)
 
@@ -206,12 +195,10 @@ def _answer_with_nuisance(
     explained: Explained,
     verdict: Verdict,
     nearest: tuple[Cause, ...],
-    model: ProcessModel,
-    effects: Sequence[Effect],
-    record: Record,
-    uncertain: Mapping[str, float],
+    problem: Problem,
 ) -> Diagnosis:
     """The diagnosis that the explanations with nuisance give."""
+    model, record = problem.model, problem.record
     is_right = verdict.verdict == NOMINAL
     best = explained.none if is_right else explained.explanations[0]
     own = convert_to_run_minutes(answer.causes_of(best, explained), record)
@@ -240,6 +227,7 @@ def _answer_with_nuisance(
         nearest=nearest,
         onset=answer.onset_of(causes),
         nuisance=answer.nuisance_of(best, explained),
+        relative_delays=answer.relative_delays(best, explained),
         remaining=remaining_of(held_out, None),
         location=causes[0].location if causes else None,
         locations=(),
@@ -247,8 +235,8 @@ def _answer_with_nuisance(
         significant=not is_right,
         gain=Gain(lead, held_out),
         experiment=None,
-        extended_model=extended_model(adjusted, effects, causes, record.zero_ns),
-        parameters=_parameters(best, explained, model, uncertain),
+        extended_model=extended_model(adjusted, problem.effects, causes, record.zero_ns),
+        parameters=_parameters(best, explained, model, problem.uncertain),
         curves=curves,
         with_nuisance=True,
     )

@@ -61,7 +61,9 @@ def curves_of(
     )
 
 
-def differences_of(model: ProcessModel, noise_sd: Array, curves: Curves) -> dict[str, Difference]:
+def differences_of(
+    model: ProcessModel, noise_sd: Array, curves: Curves, bands: Mapping[str, float]
+) -> dict[str, Difference]:
     """Differences of the simulation by output, over time and operating point, with the sensors' noise."""
     columns = curves.inputs | curves.simulated_before
     units = {item.name: item.unit for item in model.inputs} | {item.name: item.unit for item in model.outputs}
@@ -74,6 +76,7 @@ def differences_of(model: ProcessModel, noise_sd: Array, curves: Curves) -> dict
             output.unit,
             curves.time_min,
             signals,
+            bands[output.name],
         )
         for index, output in enumerate(model.outputs)
     }

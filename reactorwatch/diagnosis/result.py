@@ -54,6 +54,7 @@ class Cause(Result, frozen=True, kw_only=True):
             rows.
         probability: probability of that explanation.
         beside: names of the other causes of that explanation.
+        from_beginning: true if its onset is within two standard deviations of the beginning of its run.
     """
 
     cause: str
@@ -66,8 +67,9 @@ class Cause(Result, frozen=True, kw_only=True):
     share: float = nan
     probability: float = nan
     beside: tuple[str, ...] = ()
+    from_beginning: bool = False
 
-    python_only: ClassVar = ("run_shift_min",)
+    python_only: ClassVar = ("run_shift_min", "from_beginning")
 
 
 def make_cause(effect: Effect, profile: str, parameters: dict[str, Estimate]) -> Cause:
@@ -426,6 +428,7 @@ class Diagnosis(Result, frozen=True, kw_only=True):
         remarks: further remarks, in sentences.
         curves: curves for figures; with several runs, over `Record.continuous_min`.
         with_nuisance: true if the explanations are those with nuisance: simulated, not filtered.
+        relative_delays: delays of inputs against the outputs, where neither delay alone differs from 0.
     """
 
     file: str
@@ -456,8 +459,9 @@ class Diagnosis(Result, frozen=True, kw_only=True):
     remarks: tuple[str, ...] = ()
     curves: Curves | None = None
     with_nuisance: bool = False
+    relative_delays: tuple[Nuisance, ...] = ()
 
-    python_only: ClassVar = ("differences", "remarks", "curves", "with_nuisance")
+    python_only: ClassVar = ("differences", "remarks", "curves", "with_nuisance", "relative_delays")
 
     @property
     def is_extended(self) -> bool:

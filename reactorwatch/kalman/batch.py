@@ -33,7 +33,7 @@ LONGEST_ROW_MIN = 1.001 * 2 * LONGEST_STEP_MIN  # a row is two steps; times are 
 
 LONGEST_GAP_MIN = 30.0  # after more a filter restarts, see `ekf`
 
-LEAST_ROWS = 1000  # of a batch, for which compiling the lanes pays
+LEAST_ROWS = 4000  # of a batch, for which lanes pay: 1,300 if their code is on disk, 13,000 if it must be compiled
 
 
 class StepCost(IntEnum):

@@ -341,7 +341,9 @@ class ReorderBuffer(Generic[Item]):
         self._await_history = False
         for state in self._streams.values():
             hold = state.hold_state()
-            live = {number: held for number, held in hold.held.items() if number > state.last_before}
+            # A message of the history that arrived live is not missing in it, see `history_complete`.
+            begin = min((*hold.history, state.last_before + 1))
+            live = {number: held for number, held in hold.held.items() if number >= begin}
             hold.held = {number: (now_ns, item) for number, item in hold.history.items()} | live
             hold.history = {}
             hold.held_bytes = sum(self._size(item) for _, item in hold.held.values())

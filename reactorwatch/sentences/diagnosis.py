@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Collection, Sequence
-from math import floor, isfinite, log10
+from math import isfinite
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,6 +10,7 @@ from msgspec.structs import replace
 
 from reactorwatch.process import LOCATION_PHRASES
 from reactorwatch.process.effect import Effect
+from reactorwatch.sentences.numbers import format_error, format_interval, odds, percent, round_estimate
 from reactorwatch.terminal import printable_lines
 
 if TYPE_CHECKING:
@@ -20,7 +21,6 @@ if TYPE_CHECKING:
         Cause,
         Curves,
         Diagnosis,
-        Estimate,
         HeldOut,
         Law,
         Nuisance,
@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 INDENT = 14
 
 TIME = "time"  # the axis of time in a difference
+
+BETWEEN = " relative to the outputs"  # of a delay that is known better than the clock of either
 
 MOSTLY_NOISE, WORSE = 0.9, 1.2
 """Noise share above which no range is named; error above which a range or an output is named, relative to that of all
@@ -44,8 +46,8 @@ def describe_verdict(diagnosis: "Diagnosis", *, are_listed: bool = False) -> str
             f"The simulation is right within what was stated of its parameters: {' and '.join(off)} "
             f"{'is' if len(off) == 1 else 'are'} a little off, and the rest of the record is noise."
         )
-    if diagnosis.verdict == "nominal" and diagnosis.nuisance:
-        return f"The simulation is right but for small corrections: {describe_nuisance(diagnosis)}."
+    if diagnosis.verdict == "nominal" and (corrections := describe_nuisance(diagnosis)):
+        return f"The simulation is right but for small corrections: {corrections}."
     if diagnosis.verdict == "nominal" and diagnosis.with_nuisance:
         return "The simulation is right but for corrections that are too small to be listed one by one."
     if diagnosis.verdict == "nominal":
@@ -74,8 +76,7 @@ def describe_verdict(diagnosis: "Diagnosis", *, are_listed: bool = False) -> str
         mostly = ", mostly by" if diagnosis.grade == "mostly" else ":"
         share = f" This removes {percent(diagnosis.causes[0].share)} of the squared error." if mostly != ":" else ""
         return f"The simulation is wrong{mostly} {'; and '.join(causes)}{alike}.{share} {matters}"
-    where = f"it acts {describe_place(diagnosis.location)}" if diagnosis.location else "this record does not tell where"
-    text = f"The simulation is wrong, and no known cause explains it; {where}."
+    text = f"The simulation is wrong, and no known cause explains it; {_describe_unknown(diagnosis)}."
     if diagnosis.grade == "nearest" and (near := nearest_causes(diagnosis)):
         nearest = near[0]
         text += f" Nearest is {nearest.label}, which removes {percent(nearest.share)} of the squared error."
@@ -86,7 +87,13 @@ def describe_verdict(diagnosis: "Diagnosis", *, are_listed: bool = False) -> str
 
 def describe_nuisance(diagnosis: "Diagnosis") -> str:
     """Small differences beside the causes, in words."""
-    return ", ".join(describe_correction(item, diagnosis.remaining) for item in diagnosis.nuisance)
+    return ", ".join(text for text, _ in list_corrections(diagnosis))
+
+
+def list_corrections(diagnosis: "Diagnosis") -> list[tuple[str, str]]:
+    """Small corrections, each with its expected range before the record."""
+    items = [*((item, "") for item in diagnosis.nuisance), *((item, BETWEEN) for item in diagnosis.relative_delays)]
+    return [(describe_correction(item, diagnosis.remaining) + more, describe_prior(item)) for item, more in items]
 
 
 def describe_correction(item: "Nuisance", outputs: Collection[str]) -> str:
@@ -131,10 +138,10 @@ def describe_training(diagnosis: "Diagnosis") -> str:
     """Deviation of a plant's training from its equations, in a sentence."""
     if diagnosis.verdict == "nominal":
         return "the training agrees with the equations"
+    text = "the training deviates from the equations"
     if not diagnosis.causes:
-        where = f" {describe_place(diagnosis.location)}" if diagnosis.location else ""
-        return f"the training deviates from the equations{where}, and no cause of the catalogue explains it"
-    text = f"the training deviates from the equations by {_join_sizes(diagnosis.causes)}"
+        return f"{text}, and no cause of the catalogue explains it; {_describe_unknown(diagnosis)}"
+    text += f" by {_join_sizes(diagnosis.causes)}"
     others = ", or ".join(_join_sizes(item.explanation) for item in diagnosis.alternatives)
     return f"{text}; its rows do not rule out {others}" if diagnosis.verdict == "ambiguous" else text
 
@@ -165,7 +172,7 @@ def law_rows(law: "Law") -> list[tuple[str, str]]:
     ranges = ", ".join(f"{name} from {low:.4g} to {high:.4g}" for name, (low, high) in law.range.items())
     rows.append(("range", f"seen with {ranges}; it need not hold outside"))
     rows += [
-        ("or", f"{item.formula} ({item.form}, {describe_place(item.location)}), worse by {item.delta_bic:.1f} in BIC")
+        ("or", f"{item.formula} ({item.form}, {describe_place(item.location)}), {_less_likely(item.delta_bic)}")
         for item in law.rivals
     ]
     return rows
@@ -188,6 +195,22 @@ def describe_place(location: str) -> str:
     return f"at {location}" if words is None else f"in {words[1].replace('_', ' ')} {words[2]}".rstrip()
 
 
+def describe_best_place(diagnosis: "Diagnosis") -> str:
+    """Place of a deviation without a cause, with its odds against the next place."""
+    place, listed = describe_place(diagnosis.location or "record"), diagnosis.locations
+    if not listed or listed[0].location != diagnosis.location:
+        return place
+    if len(listed) == 1:  # all others are worse by 10 BIC or more
+        return f"{place} (odds of over 100 to 1 against any other place)"
+    return f"{place} (odds of {odds(listed[1].delta_bic)} against the next, {describe_place(listed[1].location)})"
+
+
+def _describe_unknown(diagnosis: "Diagnosis") -> str:
+    if not diagnosis.location:
+        return "this record does not tell where it acts"
+    return f"an unknown deviation of a single place fits best {describe_best_place(diagnosis)}"
+
+
 def describe_timing(cause: "Cause", curves: "Curves | None" = None) -> str:
     """Onset of a cause, or its profile in time."""
     if cause.profile == "constant":
@@ -197,7 +220,7 @@ def describe_timing(cause: "Cause", curves: "Curves | None" = None) -> str:
     if cause.profile == "free":
         largest = "" if curves is None else f", largest at {_largest_min(cause, curves):.4g} min"
         return f"changing over the record{largest}"
-    since = f"since {format_interval(cause.parameters['onset'])}"
+    since = "from the beginning" if cause.from_beginning else f"since {format_interval(cause.parameters['onset'])}"
     if (cause.run or 1) > 1:
         since += f" of run {cause.run}"
     if cause.profile == "ramp":
@@ -259,47 +282,9 @@ def describe_causes(causes: Sequence[tuple[str, str]], effects: Sequence[Effect]
     return " with ".join(labels)
 
 
-def format_interval(estimate: "Estimate") -> str:
-    """Estimate and half width of its 95 % interval, with the unit.
-
-    >>> from reactorwatch.diagnosis.result import Estimate
-    >>> format_interval(Estimate(-0.0499634, 8.5e-5, "1"))
-    '-0.04996 ± 0.00017'
-    >>> format_interval(Estimate(299.9, 0.0, "min"))
-    '299.9 min'
-    """
-    unit = "" if estimate.unit == "1" else f" {estimate.unit}"
-    value, half = round_estimate(estimate)
-    return f"{value} ± {half}{unit}" if half else f"{value}{unit}"
-
-
-def round_estimate(estimate: "Estimate") -> tuple[str, str]:
-    """Estimate and half width of its 95 % interval with equal decimals; the latter empty if it is not known.
-
-    The interval has one digit, or two if it begins with a 1.
-
-    >>> from reactorwatch.diagnosis.result import Estimate
-    >>> round_estimate(Estimate(14.998, 0.0127, "%"))
-    ('15.00', '0.02')
-    """
-    half = estimate.half_width
-    if not (isfinite(half) and half > 0.0):
-        return f"{estimate.value:.5g}", ""
-    first = floor(log10(half))
-    decimals = -first + (half < 2.0 * 10.0**first)
-    if decimals < 0:
-        return f"{round(estimate.value, decimals):.0f}", f"{round(half, decimals):.0f}"
-    return f"{estimate.value:.{decimals}f}", f"{half:.{decimals}f}"
-
-
 def describe_parameter(item: "AdjustedParameter") -> str:
     """Estimate of an uncertain parameter, with its prior."""
     return f"{format_interval(item.estimate)}; stated: {format_interval(item.prior)}"
-
-
-def format_error(value: float, unit: str) -> str:
-    """Root mean square error; none if the simulation diverged."""
-    return f"{value:.3g} {unit}" if isfinite(value) else "none, it ran away"
 
 
 def describe_remaining(item: "Remaining") -> str:
@@ -313,24 +298,35 @@ def describe_holdout(name: str, item: "HeldOut", *, improved: bool) -> str:
     return f"{name} off by {format_error(item.rmse_after, item.unit)}{before}; noise {item.noise_sd:.3g} {item.unit}"
 
 
-def describe_difference(name: str, item: "Difference") -> str:
-    """Error of the simulation, its share of noise, and the ranges where it is largest, in a sentence."""
+def describe_difference(item: "Difference") -> str:
+    """Error of the simulation in an output, its share of noise, and the time or operating point where it is largest."""
     if not isfinite(item.rmse):
-        return f"{name}: the simulation ran away from the record."
-    text = f"{name}: the simulation errs by {item.rmse:.3g} {item.unit}, {percent(item.noise_share)} of it noise"
+        return "without limit: the simulation ran away from the record"
+    text = f"by {item.rmse:.3g} {item.unit}, {percent(item.noise_share)} of it noise"
     if item.noise_share > MOSTLY_NOISE:
-        return f"{text}."
-    places = [
-        f"{'from' if axis == TIME else f'at {axis}'} {part.lower:.4g} to {part.upper:.4g} {unit} ({part.rmse:.3g})"
-        for axis, unit in item.units.items()
-        if (part := item.worst(axis)) is not None and part.rmse > WORSE * item.rmse
-    ]
-    return f"{text}; most {', '.join(places)}." if places else f"{text}; everywhere alike."
+        return text
+    worst = {axis: part for axis in item.units if (part := item.worst(axis)) and part.rmse > WORSE * item.rmse}
+    if not worst:
+        return f"{text}; everywhere alike"
+    axis, part = max(worst.items(), key=lambda pair: (pair[0] == TIME, pair[1].rmse))
+    where = "from" if axis == TIME else f"at {axis}"
+    return f"{text}; most {where} {part.lower:.4g} to {part.upper:.4g} {item.units[axis]} ({part.rmse:.3g})"
+
+
+def _differences(diagnosis: "Diagnosis") -> list[str]:
+    """Lines of the outputs that differ in practice, and the count of the others."""
+    shown = {name: item for name, item in diagnosis.differences.items() if item.matters}
+    lines = [_line("differs", f"{name} {describe_difference(item)}") for name, item in shown.items()]
+    if (few := len(diagnosis.differences) - len(shown)) > 0:
+        what = f"{few} {'other ' if shown else ''}output{'s' if few > 1 else ''}"
+        lines.append(_line("differs", f"{what} by less than matters in practice"))
+    return lines
 
 
 def describe_weight(item: "Cause | Alternative") -> str:
-    """Share of the squared error that an explanation removes, and its probability."""
-    return f"removes {percent(item.share)} of the squared error; {percent(item.probability)} likely"
+    """Share of the squared error that an explanation removes, and its probability among all explanations."""
+    likely = f"{percent(item.probability)} likely against the other causes"
+    return f"removes {percent(item.share)} of the squared error; {likely}"
 
 
 def acts_alike(alternative: "Alternative") -> bool:
@@ -352,15 +348,8 @@ def nearest_causes(diagnosis: "Diagnosis") -> list["Cause"]:
     return sorted((item for item in diagnosis.nearest if item.share >= 0.01), key=lambda item: -item.share)
 
 
-def percent(share: float) -> str:
-    """A share or a probability in per cent.
-
-    >>> percent(0.9997), percent(0.354)
-    ('more than 99 %', '35 %')
-    """
-    if share < 0.01:
-        return "less than 1 %"
-    return "more than 99 %" if share > 0.99 else f"{100.0 * share:.0f} %"
+def _less_likely(delta_bic: float) -> str:
+    return f"less likely by odds of {odds(delta_bic)}"
 
 
 def _largest_min(cause: "Cause", curves: "Curves") -> float:
@@ -387,8 +376,8 @@ def diagnosis_text(diagnosis: "Diagnosis", effects: Sequence[Effect]) -> str:
         ]
     if diagnosis.causes and isfinite(diagnosis.causes[0].share) and not ambiguous:
         lines.append(_line("share", describe_weight(diagnosis.causes[0])))
-    if diagnosis.nuisance and diagnosis.verdict != "nominal":
-        lines.append(_line("corrections", f"{describe_nuisance(diagnosis)}  (95 %)"))
+    if diagnosis.verdict != "nominal" and (corrections := describe_nuisance(diagnosis)):
+        lines.append(_line("corrected", f"{corrections}  (95 %)"))
     if diagnosis.causes and (after := following(diagnosis)) is not None:
         lines.append(_line("next", f"{after.label} ({after.cause}, {after.profile}), which {describe_weight(after)}"))
     for near in nearest_causes(diagnosis):
@@ -396,17 +385,16 @@ def diagnosis_text(diagnosis: "Diagnosis", effects: Sequence[Effect]) -> str:
         lines.append(_line("nearest", f"{describe_explanation([near], effects)}; {removed}"))
     if len(diagnosis.locations) > 1 and diagnosis.verdict != "named":  # named causes have their places
         places = [
-            describe_place(item.location)
-            + (f", worse by {item.delta_bic:.1f} in BIC" if item.delta_bic >= 0.05 else "")
+            describe_place(item.location) + (f", {_less_likely(item.delta_bic)}" if item.delta_bic >= 0.05 else "")
             for item in diagnosis.locations
         ]
         lines.append(_line("where", "; ".join(places)))
     if diagnosis.law is not None:
         lines += [_line(name, text) for name, text in law_rows(diagnosis.law)]
     if diagnosis.is_extended and not diagnosis.with_nuisance:
-        lines.append(_line("evidence", f"{diagnosis.gain.delta_bic:,.1f} in BIC over the simulation as it was"))
+        lines.append(_line("evidence", f"odds of {odds(diagnosis.gain.delta_bic)} against the simulation as it was"))
     if diagnosis.verdict != "nominal":
-        lines += [_line("differs", describe_difference(name, item)) for name, item in diagnosis.differences.items()]
+        lines += _differences(diagnosis)
     for name, known in diagnosis.parameters.items():
         lines.append(_line("parameter", f"{name} {describe_parameter(known)}  (95 %)"))
     for name, item in diagnosis.gain.held_out.items():
@@ -427,7 +415,7 @@ def _alternatives(diagnosis: "Diagnosis", effects: Sequence[Effect]) -> list[str
 def describe_rival(item: "Alternative", diagnosis: "Diagnosis") -> str:
     """Comparison of an alternative with the best explanation."""
     if not diagnosis.with_nuisance:
-        return f"worse by {item.delta_bic:.1f} in BIC"
+        return _less_likely(item.delta_bic)
     return "which acts the same in this record" if acts_alike(item) else f"which {describe_weight(item)}"
 
 

@@ -33,6 +33,7 @@ from reactorwatch.diagnosis.result import LISTED, Experiment, ExperimentCurves, 
 from reactorwatch.diagnosis.run import Run
 from reactorwatch.diagnosis.search.search import FittedHypothesis
 from reactorwatch.process.model import ProcessModel
+from reactorwatch.sentences.numbers import odds
 
 MOST_ALTERNATIVES = 5
 
@@ -167,9 +168,8 @@ class _ExperimentSearch:
         would = "would" if hardest.probability >= LIKELY else "might"
         why = (
             f"{span_min:.4g} min with {item.name} stepping between {levels.min():g} and {levels.max():g} {item.unit} "
-            f"{would} decide between {self._list_labels(names)}{but}: the two that are hardest to tell apart are "
-            f"expected to differ by {hardest.expected_delta_bic:.0f} in BIC, by more than {LISTED:g} with a "
-            f"probability of {_percent(hardest.probability)} %."
+            f"{would} decide between {self._list_labels(names)}{but}: the two that are hardest to tell apart "
+            f"would be apart by odds of over {odds(LISTED)} with a probability of {_percent(hardest.probability)} %."
         )
         curves = {
             alternative.name: dict(zip(self._model.output_names, run.measured.T, strict=True))

@@ -92,6 +92,24 @@ def nuisance_of(item: Explanation, explained: Explained) -> tuple[Nuisance, ...]
     return tuple(result)
 
 
+def relative_delays(item: Explanation, explained: Explained) -> tuple[Nuisance, ...]:
+    """Delays of inputs against the mean of the outputs that differ from 0, where none of these does alone.
+
+    Times are known only against each other: a later input and earlier outputs are the same to a simulation.
+    """
+    nuisance, fitted, result = explained.nuisance, item.fitted, list[Nuisance]()
+    sds, n_y = nuisance.sds(fitted.hypothesis.prior), len(nuisance.simulation.model.outputs)
+    for index in range(nuisance.input_delays.start, nuisance.input_delays.stop):
+        weights = np.zeros(len(fitted.information))
+        weights[nuisance.output_delays], weights[index] = 1.0 / n_y, 1.0
+        own, used = weights[: nuisance.size], np.flatnonzero(weights)
+        value, sd = float(own @ fitted.theta), float(np.sqrt(weights @ np.linalg.solve(fitted.information, weights)))
+        if abs(value) > WORTH * sd and np.all(np.abs(fitted.theta[used]) <= WORTH * fitted.theta_sd[used]):
+            prior_sd = float(np.linalg.norm(own * sds))
+            result.append(Nuisance(nuisance.names[index], Estimate(value, sd, "min"), prior_sd))
+    return tuple(result)
+
+
 def adjusted_model(item: Explanation, explained: Explained, model: ProcessModel) -> ProcessModel:
     """The model with the nuisance of its parameters in their values."""
     nuisance, values = explained.nuisance, dict[str, float]()

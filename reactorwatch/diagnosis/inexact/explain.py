@@ -190,7 +190,7 @@ class _Comparison:
         starts = np.zeros((len(sim.begins), len(sim.model.states), len(sim.effects) * courses.interval_mean.shape[1]))
         causes = nuisance.derivatives(theta, found.slopes, starts, ProductForcing(courses))
         whitened = noise.whiten(self._fitter.residual(theta, simulated))
-        base, causes = (noise.whiten(self._fitter.mask(item)) for item in (found.nuisance, causes))
+        base, causes = (noise.whiten(self._fitter.mask(item)) for item in (found.derivatives, causes))
         values = whitened.size
         return Screen(
             nuisance,

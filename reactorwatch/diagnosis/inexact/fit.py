@@ -28,8 +28,8 @@ from reactorwatch.diagnosis.inexact.hypotheses import (
     random_walk,
 )
 from reactorwatch.diagnosis.inexact.noise import Discrepancy
-from reactorwatch.diagnosis.inexact.nuisance import Linearised, Nuisance
-from reactorwatch.diagnosis.inexact.simulation import Forcing, Simulated
+from reactorwatch.diagnosis.inexact.nuisance import Nuisance
+from reactorwatch.diagnosis.inexact.simulation import Simulated
 
 STEPS = 8
 """Steps of a fit."""
@@ -220,9 +220,9 @@ class _Fit:
         """Derivatives, the same whitened, information and gradient at a point; those of the last one are kept."""
         if self._last is not None and self._last[0] is point:
             return self._last[1]
-        found = self._nuisance.linearise(point.theta, point.simulated)
-        derivatives = np.concatenate([found.nuisance, self._own_derivatives(point, found)], axis=2)
-        masked = self._fitter.mask(derivatives)
+        course = self._by_parameters(point.own)
+        found = self._nuisance.linearise(point.theta, point.simulated, self._hypothesis.effect, course)
+        masked = self._fitter.mask(found.derivatives)
         if self._moves is None:
             self._moves = masked[:, :, self._nuisance.moves].copy()
         white = self._noise.whiten(masked)
@@ -235,26 +235,17 @@ class _Fit:
         self._last = point, result
         return result
 
-    def _own_derivatives(self, point: _Point, found: Linearised) -> Array:
-        """Derivatives of the readings by the parameters of the cause."""
-        rows = self._nuisance.simulation.rows.size
-        if not point.own.size:
-            return np.zeros((rows, found.read.shape[1], 0))
-        courses, kind, index = self._fitter._courses, self._hypothesis.kind, self._hypothesis.effect
-        if self._is_timed:
-            onset, size = float(point.own[1]), float(point.own[0])
-            one, other = courses.course(kind, onset), courses.by_onset(kind, onset)
-            mean, value = (
-                np.column_stack([getattr(one, name), size * getattr(other, name)])
-                for name in ("interval_mean", "sample_value")
-            )
-        else:
-            mean, value = self._fitter._hats.interval_mean @ self._walk, self._fitter._hats.sample_value @ self._walk
-        slopes = found.slopes
-        forcing = Forcing(slopes.b[:, :, index, None] * mean[:-1, None], slopes.d[:, :, index, None] * value[:, None])
-        parts, n_x = len(self._nuisance.simulation.begins), slopes.a.shape[1]
-        starts = np.zeros((parts, n_x, mean.shape[1]))
-        return self._nuisance.derivatives(point.theta, slopes, starts, forcing)
+    def _by_parameters(self, own: Array) -> Signal | None:
+        """Derivatives of the cause's deviation by each of its parameters, shape (rows, parameters), if any."""
+        if not own.size:
+            return None
+        courses, hats = self._fitter._courses, self._fitter._hats
+        if not self._is_timed:
+            return Signal(hats.interval_mean @ self._walk, hats.sample_value @ self._walk)
+        size, onset = own.tolist()
+        one, other = (of(self._hypothesis.kind, onset) for of in (courses.course, courses.by_onset))
+        mean = np.column_stack([one.interval_mean, size * other.interval_mean])
+        return Signal(mean, np.column_stack([one.sample_value, size * other.sample_value]))
 
     def _result(self, point: _Point, derivatives: Array, white: Array, information: Array) -> Fitted:
         flat = white.reshape(-1, white.shape[-1])

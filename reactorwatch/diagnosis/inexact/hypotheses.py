@@ -5,12 +5,13 @@ than its prior allows: that is a constant deviation, a delay or a lag.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 
 from reactorwatch.arrays import Array
-from reactorwatch.diagnosis.fitting.profiles import Signal
+from reactorwatch.diagnosis.fitting.profiles import FittedProfile, PiecewiseLinear, Ramp, Signal, Step
 from reactorwatch.diagnosis.inexact.nuisance import Prior
 
 ONSETS, KNOTS = 24, 25
@@ -69,6 +70,10 @@ class Courses:
     period_min: float
     expected_min: float | None = None
 
+    @cached_property
+    def _profiles(self) -> dict[str, FittedProfile]:
+        return {STEP: Step(self.time_min), RAMP: Ramp(self.time_min)}
+
     @property
     def span_min(self) -> float:
         """Duration from the first row to the last."""
@@ -90,35 +95,24 @@ class Courses:
 
     def course(self, kind: str, onset: float) -> Signal:
         """Course of a step, of size 1, or a ramp that reaches 1 at the end of the run."""
-        begin, end = self.time_min, np.append(self.time_min[1:], self.time_min[-1] + self.period_min)
-        if kind == STEP:
-            mean = np.clip((end - onset) / (end - begin), 0.0, 1.0)
-            return Signal(mean, (begin >= onset).astype(float))
-        span = max(float(self.time_min[-1]) - onset, self.period_min)
-        late = [np.maximum(item - onset, 0.0) / span for item in (begin, end)]
-        return Signal(0.5 * (late[0] + late[1]), late[0])
+        return self._profiles[kind].signal(np.array([1.0, onset]))
 
     def by_onset(self, kind: str, onset: float) -> Signal:
         """Derivative of a course by its onset; a sensor's step jumps, so its derivative is that over a row."""
         half = 0.5 * self.period_min
         ahead, behind = self.course(kind, onset + half), self.course(kind, onset - half)
-        mean, value = (
-            (a - b) / (2.0 * half)
-            for a, b in ((ahead.interval_mean, behind.interval_mean), (ahead.sample_value, behind.sample_value))
-        )
-        return Signal(mean, value)
+        mean, value = ahead.interval_mean - behind.interval_mean, ahead.sample_value - behind.sample_value
+        return Signal(mean / self.period_min, value / self.period_min)
 
     def hats(self) -> Signal:
         """Functions that are 1 at a knot and 0 at the others, shape (rows, KNOTS)."""
-        times, knots = self.time_min, self.knots
-        value = np.maximum(0.0, 1.0 - np.abs(times[:, None] - knots) / (knots[1] - knots[0]))
-        return Signal(np.vstack([0.5 * (value[:-1] + value[1:]), value[-1:]]), value)
+        return PiecewiseLinear(self.time_min, KNOTS).basis_signals(np.empty(0))
 
     def steps(self) -> Signal:
         """Steps at all onsets, shape (rows, onsets)."""
         each = [self.course(STEP, onset) for onset in self.onsets.tolist()]
-        mean, value = np.column_stack([item.interval_mean for item in each]), [item.sample_value for item in each]
-        return Signal(mean, np.column_stack(value))
+        mean, value = [item.interval_mean for item in each], [item.sample_value for item in each]
+        return Signal(np.column_stack(mean), np.column_stack(value))
 
     def ramp_weights(self) -> Array:
         """Weights of the hats whose sum is a ramp from each onset, shape (KNOTS, onsets)."""

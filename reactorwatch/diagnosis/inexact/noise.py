@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from math import log, sqrt
 
 import numpy as np
+from scipy.linalg.lapack import dtbtrs
 
 from reactorwatch.arrays import Array
 
@@ -31,12 +32,24 @@ class Discrepancy:
 
     def whiten(self, values: Array) -> Array:
         """Whiten residuals or their derivatives, shape (rows, n_y, ...), in the standard deviation of e."""
-        from scipy.signal import lfilter  # only here and below: to import it is a third of a start
-
         result = np.empty_like(values)
         for j, (a, b, sd) in enumerate(zip(self.a, self.b, self.sd, strict=True)):
-            result[:, j] = lfilter([1.0, -a], [1.0, -b], values[:, j], axis=0) / sd
+            result[:, j] = filter_first_order(values[:, j], 1.0, -a, b) / sd
         return result
+
+
+def filter_first_order(x: Array, now: float, before: float, pole: float, start: Array | float = 0.0) -> Array:
+    """Filter y_t = pole y_{t-1} + now x_t + before x_{t-1} along the first axis, the first row with `start` added.
+
+    `scipy.signal` has it, and takes half a second to import.
+    """
+    driven = now * x
+    driven[1:] += before * x[:-1]
+    driven[:1] += start
+    if not pole:
+        return driven
+    bands, columns = np.array([np.ones(len(x)), np.full(len(x), -pole)]), driven.reshape(len(x), -1)
+    return np.asarray(dtbtrs(bands, columns, uplo="L", diag="U")[0].reshape(x.shape))
 
 
 def white(sd: Array) -> Discrepancy:
@@ -46,8 +59,6 @@ def white(sd: Array) -> Discrepancy:
 
 def estimate_discrepancy(residual: Array, smallest_sd: Array) -> Discrepancy:
     """ARMA(1, 1) of residuals, shape (rows, n_y), 0 where not measured, by maximum likelihood over a grid."""
-    from scipy.signal import lfilter
-
     found = []
     for r, least in zip(residual.T, smallest_sd, strict=True):
         n = max(int(np.count_nonzero(r)), 1)
@@ -55,7 +66,7 @@ def estimate_discrepancy(residual: Array, smallest_sd: Array) -> Discrepancy:
         loss = n * log(best[2]) - COLOURED
         for a in POLES:
             for b in (item for item in ZEROS if item < a):
-                e = lfilter([1.0, -a], [1.0, -b], r)
+                e = filter_first_order(r, 1.0, -a, b)
                 sd = max(sqrt(float(e @ e) / n), float(least))
                 if n * log(sd) < loss:
                     best, loss = (a, b, sd), n * log(sd)

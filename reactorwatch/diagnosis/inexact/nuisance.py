@@ -61,12 +61,13 @@ class Linearised:
 
     Attributes:
         read: readings at all rows, shape (rows, n_y).
-        nuisance: derivatives of the readings at the kept rows by all nuisance, shape (kept rows, n_y, n).
+        derivatives: derivatives of the readings at the kept rows by all nuisance, then by the parameters of a cause,
+            shape (kept rows, n_y, n).
         slopes: derivatives along the simulation.
     """
 
     read: Array
-    nuisance: Array
+    derivatives: Array
     slopes: Slopes
 
 
@@ -171,13 +172,24 @@ class Nuisance:
             slopes, sim.rows
         )
 
-    def linearise(self, theta: Array, simulated: Simulated) -> Linearised:
-        """Readings of a simulation, and their derivatives by all nuisance."""
+    def linearise(self, theta: Array, simulated: Simulated, cause: int = 0, course: Signal | None = None) -> Linearised:
+        """Readings of a simulation, and their derivatives by all nuisance and by the parameters of a cause.
+
+        Args:
+            theta: nuisance of the simulation.
+            simulated: the simulation.
+            cause: index of the effect that is the cause.
+            course: derivatives of its deviation by each of its parameters, shape (rows, parameters); None: no cause.
+        """
         sim, rows = self.simulation, self.simulation.run.time_min.size
         slopes = sim.slopes(simulated)
-        n_x, n_states = len(sim.model.states), self.starts.stop
-        states, outputs = np.zeros((rows - 1, n_x, self.size)), np.zeros((rows, slopes.c.shape[1], self.size))
+        n_x, n_states, n = len(sim.model.states), self.starts.stop, self.size
+        n += 0 if course is None else course.sample_value.shape[1]
+        states, outputs = np.zeros((rows - 1, n_x, n)), np.zeros((rows, slopes.c.shape[1], n))
         states[:, :, self.effects], outputs[:, :, self.effects] = slopes.b, slopes.d
+        if course is not None:
+            states[:, :, self.size :] = slopes.b[:, :, cause, None] * course.interval_mean[:-1, None]
+            outputs[:, :, self.size :] = slopes.d[:, :, cause, None] * course.sample_value[:, None]
         driven = self._input_derivatives(theta)
         states[:, :, self.input_delays.start : self.input_lags.stop] = slopes.g[:, :, driven[1]] * driven[0][:, None]
         for number, (row, j) in enumerate(self._moves, start=self.moves.start):
@@ -185,7 +197,7 @@ class Nuisance:
                 states[row, :, number] = -slopes.g[row, :, j] * (
                     simulated.inputs[row, j] - simulated.inputs[row - 1, j]
                 )
-        starts = np.zeros((len(self._usual_starts), n_x, self.size))
+        starts = np.zeros((len(self._usual_starts), n_x, n))
         starts[..., :n_states] = np.eye(n_states).reshape(-1, n_x, n_states)
         found = self.derivatives(theta, slopes, starts, Forcing(states, outputs))
         read = self.read(simulated, theta)

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.compiled_function import CompiledFunction
 from reactorwatch.diagnosis.fitting.profiles import Signal
+from reactorwatch.diagnosis.inexact.noise import filter_first_order
 from reactorwatch.diagnosis.run import Run
 from reactorwatch.process.effect import TIMING, Effect
 from reactorwatch.process.model import ProcessModel
@@ -229,11 +230,9 @@ class InexactSimulation:
 
     def _lag_mean(self, held: Array, lag: float) -> Array:
         """Mean of a first-order lag's output over each interval, of an input that is held over each."""
-        from scipy.signal import lfilter  # only here and below: to import it is a third of a start
-
         h = self.run.period_min
         kept = float(np.exp(-h / lag))
-        after = lfilter([1.0 - kept], [1.0, -kept], held, zi=[kept * held[0]])[0]
+        after = filter_first_order(held, 1.0 - kept, 0.0, kept, kept * held[0])
         before = np.append(held[0], after[:-1])
         return np.asarray(held + (before - held) * lag / h * (1.0 - kept))
 
@@ -241,8 +240,6 @@ class InexactSimulation:
         """Readings of outputs, or of derivatives, each behind its delay and lag; shape as `y`, (rows, n_y, ...)."""
         if not (np.any(delays) or np.any(lags)):
             return y
-        from scipy.signal import lfilter
-
         result = y.copy()
         for j, (delay, lag) in enumerate(zip((delays / period_min).tolist(), lags.tolist(), strict=True)):
             if delay:
@@ -253,8 +250,8 @@ class InexactSimulation:
             if lag > 0.0:
                 kept = float(np.exp(-period_min / lag))
                 rest = lag / period_min * (1.0 - kept)
-                taps, start = [1.0 - rest, rest - kept], rest * result[:1, j]
-                result[:, j] = lfilter(taps, [1.0, -kept], result[:, j], axis=0, zi=start)[0]
+                late, start = result[:, j], rest * result[:1, j]
+                result[:, j] = filter_first_order(late, 1.0 - rest, rest - kept, kept, start)
         return result
 
 

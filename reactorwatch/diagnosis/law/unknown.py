@@ -320,9 +320,8 @@ class Localised:
     @property
     def locations(self) -> dict[str, float]:
         """BIC of each location within `LISTED` over that of the best, the best first."""
-        if self.curve is not None:
-            return {self.curve.effect.location: 0.0}
-        return {name: worse for name, worse in self.found.locations.items() if worse < LISTED}
+        found = self.found.locations if self.curve is None else self.curve.locations
+        return {name: worse for name, worse in found.items() if worse < LISTED}
 
     @property
     def location(self) -> str:

@@ -20,23 +20,22 @@ from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.profiles import FREE_NAME, PROFILES
 from reactorwatch.sentences.diagnosis import (
     acts_alike,
+    describe_best_place,
     describe_causes,
-    describe_correction,
     describe_difference,
     describe_parameter,
     describe_place,
-    describe_prior,
     describe_remaining,
     describe_rival,
     describe_size,
     describe_timing,
     describe_verdict,
     describe_weight,
-    format_interval,
     law_rows,
+    list_corrections,
     nearest_causes,
-    percent,
 )
+from reactorwatch.sentences.numbers import format_interval, odds, percent
 
 PRINTED = 80
 """Signs of an equation that fit on a line of A4 in 11 pt, as Chromium draws them."""
@@ -87,16 +86,15 @@ def as_page(
         diagnosis=diagnosis,
         file=file,
         verdict=describe_verdict(diagnosis, are_listed=True),
-        place="" if diagnosis.verdict == NOMINAL else describe_place(diagnosis.location or "record"),
+        place="" if diagnosis.verdict == NOMINAL else describe_best_place(diagnosis),
         alternatives=rivals,
         weight=describe_weight(diagnosis.causes[0]) if diagnosis.causes and isfinite(diagnosis.causes[0].share) else "",
         twins=[] if rivals else [item for item in diagnosis.alternatives if acts_alike(item)],
         remaining=[(name, describe_remaining(item)) for name, item in diagnosis.remaining.items()],
-        corrections=[
-            (describe_correction(item, diagnosis.remaining), describe_prior(item)) for item in diagnosis.nuisance
-        ],
+        corrections=list_corrections(diagnosis),
         nearest=nearest_causes(diagnosis),
         percent=percent,
+        odds=odds,
         where=describe_place,
         when=describe_timing,
         size=lambda cause: describe_size(cause, effects),
@@ -116,7 +114,10 @@ def as_page(
         extended=diagnosis.is_extended,
         is_compared=diagnosis.is_extended or diagnosis.with_nuisance,
         residuals=panels.residuals(diagnosis, model),
-        differences=[(describe_difference(name, item), _strips(item)) for name, item in diagnosis.differences.items()],
+        differences=[
+            (f"{name} differs {describe_difference(item)}.", _strips(item))
+            for name, item in diagnosis.differences.items()
+        ],
         white=WHITE,
         evidence=_evidence(diagnosis, effects),
         experiment=[] if diagnosis.experiment is None else panels.experiment(diagnosis.experiment, model),
@@ -169,15 +170,17 @@ def _strips(item: Difference) -> list[tuple[str, list[tuple[str, str, int]]]]:
 
 def _evidence(diagnosis: Diagnosis, effects: Sequence[Effect]) -> list[tuple[str, str]]:
     if diagnosis.with_nuisance:
-        causes = [(item, describe_causes([(item.cause, item.profile)], effects)) for item in diagnosis.nearest]
-        return [(text, f"{percent(item.share)} removed, {percent(item.probability)} likely") for item, text in causes]
+        return [
+            (describe_causes([(item.cause, item.profile)], effects), describe_weight(item))
+            for item in diagnosis.nearest
+        ]
     if not diagnosis.is_extended:
-        return [("the simulation as it is", "0")]
+        return [("the simulation as it is", "the best")]
     best = describe_causes([(cause.cause, cause.profile) for cause in diagnosis.causes], effects)
     best = best or "the law"
-    rows = [(best, "0")]
-    rows += [(describe_causes(item.causes, effects), f"{item.delta_bic:.1f}") for item in diagnosis.alternatives]
-    return [*rows, ("the simulation as it was", f"{diagnosis.gain.delta_bic:,.1f}")]
+    rows = [(best, "the best")]
+    rows += [(describe_causes(item.causes, effects), odds(item.delta_bic)) for item in diagnosis.alternatives]
+    return [*rows, ("the simulation as it was", odds(diagnosis.gain.delta_bic))]
 
 
 def _experiment_command(experiment: Experiment | None, experiment_file: str, process: str) -> str:

@@ -186,24 +186,6 @@ _MOST_SIZES = 3.0
 
 
 @dataclass(frozen=True, eq=False)
-class CandidatePair:
-    """Two causes with profiles that may explain the innovations.
-
-    Attributes:
-        parts: the causes with initial parameters.
-        score: predicted gain in BIC.
-    """
-
-    parts: tuple[Part, ...]
-    score: float
-
-    @property
-    def causes(self) -> frozenset[str]:
-        """Names of the causes."""
-        return frozenset(part.effect.name for part in self.parts)
-
-
-@dataclass(frozen=True, eq=False)
 class _Block:
     """Columns of one cause with a profile at nonlinear parameters, shape (values, n_linear).
 
@@ -232,7 +214,7 @@ class PairScreen:
 
     def candidates(
         self, dynamics: ErrorDynamics, dynamic: Sequence["DynamicSignature"], count: int
-    ) -> list[CandidatePair]:
+    ) -> list[tuple[Part, Part]]:
         """Best candidate of each pair of causes, the most promising first.
 
         Args:
@@ -297,7 +279,7 @@ class PairScreen:
                     result[key] = _Block(candidate.effect, self._sine, period, None, g.reshape(-1, 2))
         yield from result.values()
 
-    def _rank(self, blocks: Sequence[_Block], w: Array, count: int) -> list[CandidatePair]:
+    def _rank(self, blocks: Sequence[_Block], w: Array, count: int) -> list[tuple[Part, Part]]:
         """Best candidate of each pair of causes.
 
         Bounds only reduce a gain, so the bounded gain is computed for the most promising pairs alone, until the others
@@ -321,11 +303,10 @@ class PairScreen:
             if score > best.get(key, (-inf,))[0]:
                 best[key] = (score, i, j, parameters)
         result = []
-        for score, i, j, parameters in best.values():
+        for _, i, j, parameters in sorted(best.values(), key=lambda item: -item[0])[:count]:
             middle = places[i].size
-            parts = (_part(blocks[i], parameters[:middle]), _part(blocks[j], parameters[middle:]))
-            result.append(CandidatePair(parts, score))
-        return sorted(result, key=lambda item: -item.score)[:count]
+            result.append((_part(blocks[i], parameters[:middle]), _part(blocks[j], parameters[middle:])))
+        return result
 
     def _bound_gains(
         self, blocks: Sequence[_Block], places: Sequence[NDArray[np.int64]], gram: Array, by: Array

@@ -14,6 +14,7 @@ for whatever explains the remainder better, until nothing does. A pair is a stro
 from collections.abc import Sequence
 from functools import partial
 from math import inf
+from typing import TypeAlias
 
 import numpy as np
 
@@ -21,7 +22,6 @@ from reactorwatch.diagnosis.fitting.fault_filter import FilterEvaluation, huber_
 from reactorwatch.diagnosis.fitting.hypothesis import MOST_STEPS, Hypothesis
 from reactorwatch.diagnosis.fitting.profiles import Constant, PiecewiseLinear, Signal
 from reactorwatch.diagnosis.search.dynamic_and_pair_screens import (
-    CandidatePair,
     DynamicSignature,
     PairScreen,
     can_be_together,
@@ -43,6 +43,9 @@ MOST_PROFILES, EXCHANGED = 2, 4
 
 NEAR_BEST = 20.0
 """Threshold in BIC: an exchanged pair whose rough fit is worse by more is not fitted fully."""
+
+Pair: TypeAlias = tuple[Part, Part]
+"""Two causes with profiles and initial parameters."""
 
 ROUNDS, EXCHANGES = 3, 3
 ROUGH_STEPS, EXCHANGE_STEPS = 3, 6
@@ -109,7 +112,7 @@ class _PairSearch:
         candidates = self._screen_pairs(self._result.best)
         for _ in range(ROUNDS):
             untried = self._skip_tried(candidates, best)
-            rough = sorted((self._fit(item.parts, ROUGH_STEPS) for item in track("fitting pair", untried)), key=_bic)
+            rough = sorted((self._fit(parts, ROUGH_STEPS) for parts in track("fitting pair", untried)), key=_bic)
             if not rough:
                 break
             if best is None:
@@ -180,15 +183,16 @@ class _PairSearch:
             single = self._search.evaluate(self.single.hypothesis, self.single.fit.parameters)
         return single.bic - pair.bic
 
-    def _skip_tried(self, candidates: Sequence[CandidatePair], best: FittedHypothesis | None) -> list[CandidatePair]:
+    def _skip_tried(self, candidates: Sequence[Pair], best: FittedHypothesis | None) -> list[Pair]:
         """Select pairs that were not fitted and predict more than the best pair itself."""
         result = []
-        for candidate in candidates:
-            if best is not None and candidate.causes == set(best.hypothesis.causes):
+        for pair in candidates:
+            causes = frozenset(part.effect.name for part in pair)
+            if best is not None and causes == set(best.hypothesis.causes):
                 break
-            if candidate.causes not in self._tried:
-                self._tried.add(candidate.causes)
-                result.append(candidate)
+            if causes not in self._tried:
+                self._tried.add(causes)
+                result.append(pair)
         return result
 
     def _exchange(
@@ -270,7 +274,7 @@ class _PairSearch:
         several = [[(others | {effect.name: signal})[item.name] for item in effects] for signal in signals]
         return self._search.filter(effects).evaluate_all(self._run, several)
 
-    def _screen_pairs(self, about: FittedHypothesis) -> list[CandidatePair]:
+    def _screen_pairs(self, about: FittedHypothesis) -> list[Pair]:
         """Screen for pairs that explain everything, linearised about a run."""
         search = self._search
         hypothesis, fit = about.hypothesis, about.fit

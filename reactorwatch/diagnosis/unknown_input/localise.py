@@ -67,13 +67,15 @@ class UnknownInput:
         effect: effect of the catalogue, or loss from a balance, that acts in the same way.
         bic: BIC as of a hypothesis with these hyperparameters.
         size: magnitude of the effect along the record.
-        known: mask of values that count in the BIC, shape (rows, n_y).
+        used: mask of values that count in the BIC, shape (rows, n_y).
+        locations: BIC of each location over that of the best, the best first.
     """
 
     effect: Effect
     bic: float
     size: Signal
     used: NDArray[np.bool_]
+    locations: dict[str, float]
 
     @property
     def curve(self) -> UnknownInputCurve:
@@ -120,7 +122,8 @@ def locate(
     if not np.isfinite(best.fitted.loss):
         return None
     bic = 2.0 * best.fitted.loss + NUMBERS * log(run.values)
-    return UnknownInput(best.forcing.effect, bic, best.size, reference.used)
+    worse = {item.forcing.effect.location: 2.0 * (item.fitted.loss - best.fitted.loss) for item in closer}
+    return UnknownInput(best.forcing.effect, bic, best.size, reference.used, worse)
 
 
 def _loss(state: Variable) -> Effect:

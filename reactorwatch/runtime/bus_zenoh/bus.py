@@ -246,17 +246,17 @@ class ZenohBus:
         if history_s > 0.0:  # half of it: these messages are recent enough for the queries that follow, too
             for last in self._query_cache(key_expression, f"{LAST};{history_selector(0.5 * history_s)}")[0]:
                 delivery.set_last(last, is_recent=True)
-        started, missing, known_keys = time.monotonic(), history_s > 0.0, set[str]()
+        started, missing, most = time.monotonic(), history_s > 0.0, Counter[str]()
         for number in range(MAX_QUERIES if missing else 0):
             # Mostly only a message is missing that was published during the first query.
             since_s = HEARTBEAT_S if number == 1 and is_complete else history_s
             selector = history_selector(since_s + time.monotonic() - started)
             history, is_complete = self._query_cache(key_expression, selector)
             new = sum([delivery.add_history(earlier) for earlier in history])
-            keys = {earlier.message.key for earlier in history}
+            counts = Counter(earlier.message.key for earlier in history)
             # What a second query of all does not bring either, publishers do not have: unless replies were lost again.
-            is_all = number > 1 and not new and keys >= known_keys
-            known_keys |= keys
+            is_all = number > 1 and not new and counts >= most
+            most |= counts
             missing = not (is_complete and (delivery.history_complete() or is_all))
             if not missing:
                 break

@@ -62,7 +62,7 @@ def test_wide_characters_count_twice() -> None:
 TEXT = """leak.csv: 2400 rows over 239.9 min
 The simulation is wrong: coolant leak, since 149.99 ± 0.03 min. It matters in practice.
   cause       coolant leak (coolant_flow, step)
-  differs     T: the simulation errs by 7.32 K, less than 1 % of it noise; most from 149.9 to 179.9 min (12)
+  differs     T by 7.32 K, less than 1 % of it noise; most from 149.9 to 179.9 min (12)
   suspect: 15 % of the coolant lost (94 %; coolant_flow, step at 150.0 min), unknown (6 %)
 - Alarm raised: `shewhart/T` at 150.3 min, 0.3 min after the fault
 
@@ -77,7 +77,7 @@ def test_a_report_is_wrapped_at_words_and_values_stay_in_their_column(width: int
     lines = [row for line in REPORT for row in wrap_line(line, width)]
     assert max(len(line) for line in lines if "a-name" not in line) <= width
     assert " ".join(" ".join(lines).split()).startswith(" ".join(" ".join(REPORT[:6]).split()))
-    first = next(number for number, line in enumerate(lines) if line.startswith("  differs     T: "))
+    first = next(number for number, line in enumerate(lines) if line.startswith("  differs     T by "))
     assert lines[first + 1].startswith(" " * 14)
     first = next(number for number, line in enumerate(lines) if line.startswith("  suspect: "))
     assert lines[first + 1].startswith(" " * 11)

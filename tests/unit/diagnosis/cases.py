@@ -132,7 +132,13 @@ def diagnosis_of(
     signals = {"qc": (drawn.inputs["qc"], "l/min"), "C": (drawn.simulated_before["C"], "mol/l")}
     differences = {
         name: compute_difference(
-            drawn.measured[name] - run, drawn.residual_before[name], item.noise_sd, item.unit, drawn.time_min, signals
+            drawn.measured[name] - run,
+            drawn.residual_before[name],
+            item.noise_sd,
+            item.unit,
+            drawn.time_min,
+            signals,
+            item.noise_sd,
         )
         for (name, run), item in zip(drawn.simulated_before.items(), held_out.values(), strict=True)
     }
@@ -152,7 +158,7 @@ def diagnosis_of(
         causes=causes,
         alternatives=alternatives,
         location=location or (causes[0].location if causes else None),
-        locations=(),
+        locations=(LocationEvidence(location, 0.0),) if location else (),
         law=None,
         significant=verdict != "nominal",
         practical=practical and verdict != "nominal",
@@ -231,6 +237,7 @@ CASES["inexact"] = replace(
         Nuisance("volume", Estimate(0.012, 0.002, "1"), 0.02),
     ),
     remaining={"C": Remaining(0.00202, 0.00197, "mol/l", None), "T": Remaining(0.4, 0.303, "K", None)},
+    relative_delays=(Nuisance("qc.delay", Estimate(-0.03, 0.005, "min"), 0.12),),
 )
 """Compared with nuisance: another cause acts the same."""
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from reactorwatch.diagnosis.diagnose import diagnose
-from reactorwatch.diagnosis.estimates import WITHIN_ROW, extended_model, refine
+from reactorwatch.diagnosis.estimates import WITHIN_ROW, convert_to_run_minutes, extended_model, refine
 from reactorwatch.diagnosis.fitting.colored_noise import Noise
 from reactorwatch.diagnosis.fitting.fault_filter import FaultFilter
 from reactorwatch.diagnosis.fitting.hypothesis import Hypothesis
@@ -18,6 +18,7 @@ from reactorwatch.diagnosis.search.search import Search
 from reactorwatch.process.extended_model import parse_extended_model
 from reactorwatch.process.library.cstr import EFFECTS, SideReaction, WallHeatCapacity, cstr
 from reactorwatch.process.model import ProcessModel
+from reactorwatch.records.record import Record
 from tests.hidden_effect.catalogue import named
 from tests.hidden_effect.draw import draw
 from tests.hidden_effect.excitation import NAMED_CIRCUMSTANCES
@@ -44,6 +45,20 @@ def step_of(cause: str, size: float, onset_min: float, begun_min: float) -> tupl
         Estimate(size_of, sds.get(0, float(by_fit[0])), effect.unit),
         float(by_fit[1]),
     )
+
+
+@pytest.mark.parametrize("run", [1, 2])
+@pytest.mark.parametrize(("after_min", "begins"), [(0.9, True), (1.1, False)])
+def test_an_onset_within_two_standard_deviations_of_a_run_s_beginning_is_none(
+    run: int, after_min: float, *, begins: bool
+) -> None:
+    time_min = np.concatenate([np.arange(100.0, 160.0), np.arange(60.0)])
+    record = Record(time_min, {"qc": np.zeros(120)}, "two.csv", runs=np.repeat([0, 1], 60))
+    onset_min = record.continuous_min[record.run_starts[run - 1]] + after_min
+    parameters = {"size": Estimate(1.0, 0.1, "K"), "onset": Estimate(onset_min, 0.5, "min")}
+    cause = Cause(cause="T.bias", profile="step", label="bias", location="T", parameters=parameters)
+    (found,) = convert_to_run_minutes([cause], record)
+    assert (found.from_beginning, found.run) == (begins, run)
 
 
 @pytest.mark.parametrize("onset_min", [30.005, 30.05, 30.095])

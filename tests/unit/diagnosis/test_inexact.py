@@ -3,6 +3,7 @@
 from functools import lru_cache
 from pathlib import Path
 from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
@@ -15,7 +16,8 @@ from reactorwatch.api.diagnosis import diagnose
 from reactorwatch.api.records import read_record
 from reactorwatch.diagnosis.fitting.descent import Equations, descend
 from reactorwatch.diagnosis.fitting.profiles import Signal
-from reactorwatch.diagnosis.inexact.explain import explain
+from reactorwatch.diagnosis.inexact.answer import relative_delays
+from reactorwatch.diagnosis.inexact.explain import Explained, Explanation, explain
 from reactorwatch.diagnosis.inexact.hypotheses import CONSTANT, STEP, WIDTH, Courses
 from reactorwatch.diagnosis.inexact.noise import estimate_discrepancy
 from reactorwatch.diagnosis.inexact.nuisance import Nuisance, Prior
@@ -67,7 +69,7 @@ def test_the_derivatives_by_all_nuisance_are_differences_of_simulations(late: fl
     simulated = nuisance.simulate(theta)
     assert simulated is not None
     found = nuisance.linearise(theta, simulated)
-    sizes = np.maximum(np.max(np.abs(found.nuisance), axis=(0, 1)), 1e-9)
+    sizes = np.maximum(np.max(np.abs(found.derivatives), axis=(0, 1)), 1e-9)
     for index in range(nuisance.moves.start):
         step = 1e-4 * nuisance.sds(Prior(1.0, 1.0, False))[index]
         moved = theta.copy()
@@ -76,7 +78,7 @@ def test_the_derivatives_by_all_nuisance_are_differences_of_simulations(late: fl
         assert other is not None
         difference = (nuisance.read(other, moved) - found.read) / step
         # an input that is held has a kink at each move, so the derivative by its delay is that of one side
-        assert np.max(np.abs(difference - found.nuisance[:, :, index])) < 0.1 * sizes[index], nuisance.names[index]
+        assert np.max(np.abs(difference - found.derivatives[:, :, index])) < 0.1 * sizes[index], nuisance.names[index]
 
 
 def test_the_derivatives_by_a_step_of_every_effect_are_differences_of_simulations() -> None:
@@ -154,6 +156,29 @@ def log_normal(residual: np.ndarray, columns: np.ndarray, sds: np.ndarray) -> fl
     """Log density of a residual of unit noise and normal coefficients of columns."""
     covariance = np.eye(residual.size) + (columns * sds**2) @ columns.T
     return float(multivariate_normal(np.zeros(residual.size), covariance).logpdf(residual))
+
+
+@pytest.mark.parametrize("direction", [1.0, -1.0], ids=["input late", "input early"])
+def test_a_delay_between_input_and_output_is_stated_where_only_their_sum_is_known(direction: float) -> None:
+    """The record gives the sum of both delays with a standard deviation m, and each is 0 +- s beforehand."""
+    _, _, nuisance = plant()
+    prior = Prior(0.1, 1.0, moves=False)
+    sds, delays = nuisance.sds(prior), [nuisance.input_delays.start, nuisance.output_delays.start]
+    s, m = sds[delays[0]], 0.1 * sds[delays[0]]
+    information = np.diag(sds**-2.0)
+    information[np.ix_(delays, delays)] += m**-2.0
+    theta = np.zeros(nuisance.size)
+    theta[delays] = direction * 0.4 * s
+    fitted = SimpleNamespace(hypothesis=SimpleNamespace(prior=prior), theta=theta, information=information)
+    fitted.theta_sd = np.sqrt(np.diag(np.linalg.inv(information)))
+    explained = cast(Explained, SimpleNamespace(nuisance=nuisance))
+    (found,) = relative_delays(cast(Explanation, SimpleNamespace(fitted=fitted)), explained)
+    assert found.name == f"{nuisance.simulation.model.input_names[0]}.delay"
+    assert found.value.value == pytest.approx(direction * 0.8 * s)
+    assert found.value.sd == pytest.approx((m**-2.0 + 0.5 * s**-2.0) ** -0.5)
+    assert found.prior_sd == pytest.approx(np.sqrt(2.0) * s)
+    fitted.theta = theta / 10.0
+    assert not relative_delays(cast(Explanation, SimpleNamespace(fitted=fitted)), explained)
 
 
 def test_a_stated_sd_is_the_prior_of_its_parameter_and_none_is_exact() -> None:

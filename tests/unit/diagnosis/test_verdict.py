@@ -20,7 +20,8 @@ from reactorwatch.diagnosis.decide import (
     decide_without_nuisance,
     grade_of,
 )
-from reactorwatch.diagnosis.diagnose import _alternatives, _drop_hidden, _search_evidence
+from reactorwatch.diagnosis.exact.answer import alternatives_of
+from reactorwatch.diagnosis.exact.explain import _drop_hidden, _search_evidence
 from reactorwatch.diagnosis.graded import separate_corrections
 from reactorwatch.diagnosis.result import AMBIGUOUS, LISTED, NAMED, NOMINAL, UNKNOWN, Estimate, make_cause
 from reactorwatch.diagnosis.search.search import FittedHypothesis, SearchResult
@@ -77,7 +78,7 @@ def test_the_verdict_follows_from_the_causes_near_the_best(
 def test_the_nominal_hypothesis_wins_whatever_is_near(nearest: float) -> None:
     found = result(((LEAK,), nearest), nominal=0.0)  # of which the search takes the nominal one
     assert decide_without_nuisance(_search_evidence(found, found.nominal, np.zeros(1)), None) == NOMINAL
-    assert _alternatives(found, found.nominal) == []
+    assert alternatives_of(found, found.nominal) == []
 
 
 def test_the_alternatives_are_the_best_of_every_other_set_of_causes_within_the_limit() -> None:
@@ -89,7 +90,7 @@ def test_the_alternatives_are_the_best_of_every_other_set_of_causes_within_the_l
         ((SOURCE,), LISTED),
         ((LEAK, FOULING), 9.9),
     )
-    assert [(item.hypothesis.causes, item.bic) for item in _alternatives(found, found.best)] == [
+    assert [(item.hypothesis.causes, item.bic) for item in alternatives_of(found, found.best)] == [
         ((FOULING,), BEST_BIC + 2.0),
         ((LEAK, FOULING), BEST_BIC + 9.9),
     ]

@@ -244,6 +244,18 @@ def test_the_history_is_delivered_when_nothing_is_missing_up_to_the_live_message
     assert list(order.end_history(0)) == list(range(10))
 
 
+def test_a_message_that_arrived_live_is_not_missing_from_the_history() -> None:
+    """Number 4 arrived live, its publisher had come to 5 when it was queried, and the reply with 4 was lost."""
+    order = ReorderBuffer[int](await_history=True)
+    fed(order, [4, 5, 6])
+    order.set_last(1, STREAM, "T", 5)
+    for number in (2, 3, 5):
+        order.add_history(1, STREAM, "T", number, number)
+    assert order.history_complete()
+    assert list(order.end_history(0)) == [2, 3, 4, 5, 6]
+    assert order.due_ns() is None
+
+
 @pytest.mark.parametrize(
     ("recent", "held", "history", "complete"),
     [

@@ -14,11 +14,12 @@ from reactorwatch.process.library.cstr import EFFECTS
 from reactorwatch.sentences.diagnosis import (
     describe_correction,
     describe_size,
+    describe_timing,
     describe_training,
     describe_verdict,
     diagnosis_text,
-    format_interval,
 )
+from reactorwatch.sentences.numbers import format_interval
 from tests.unit.diagnosis.cases import ADJUSTED, CASES, ROWS
 
 
@@ -44,8 +45,14 @@ from tests.unit.diagnosis.cases import ADJUSTED, CASES, ROWS
         ),
         (
             "unknown",
-            "The simulation is wrong, and no known cause explains it; it acts in the energy balance. "
-            "It matters in practice.",
+            "The simulation is wrong, and no known cause explains it; an unknown deviation of a single place fits "
+            "best in the energy balance (odds of over 100 to 1 against any other place). It matters in practice.",
+        ),
+        (
+            "law",
+            "The simulation is wrong, and no known cause explains it; an unknown deviation of a single place fits "
+            "best in the energy balance (odds of 9.5 to 1 against the next, on the side of the coolant). A law "
+            "explains it: a (T/440)^n, added to dT/dt. It matters in practice.",
         ),
         (
             "inexact",
@@ -54,8 +61,9 @@ from tests.unit.diagnosis.cases import ADJUSTED, CASES, ROWS
         ),
         (
             "nearest",
-            "The simulation is wrong, and no known cause explains it; it acts in the energy balance. Nearest is wrong "
-            "feed temperature, which removes 41 % of the squared error. It matters in practice.",
+            "The simulation is wrong, and no known cause explains it; an unknown deviation of a single place fits "
+            "best in the energy balance (odds of over 100 to 1 against any other place). Nearest is wrong feed "
+            "temperature, which removes 41 % of the squared error. It matters in practice.",
         ),
     ],
 )
@@ -123,7 +131,7 @@ def test_people_read_sizes_onsets_rivals_experiment_gain_and_remarks() -> None:
         "C off by 0.00202 mol/l, before 0.0147 mol/l; noise 0.00197 mol/l",
         "T off by 0.292 K, before none, it ran away; noise 0.303 K",
         "or          wrong feed temperature (feed_temperature, step): feed warmer by 1.23 K (± 0.10 K), since 150.1 ± "
-        "0.8 min, worse by 3.2 in BIC",
+        "0.8 min, less likely by odds of 5 to 1",
         "experiment  Wider steps of qc tell both apart.",
     ):
         assert part in text
@@ -136,20 +144,45 @@ def test_people_read_sizes_onsets_rivals_experiment_gain_and_remarks() -> None:
 def test_with_nuisance_people_read_shares_probabilities_and_corrections_instead_of_bic() -> None:
     text = diagnosis_text(CASES["inexact"], EFFECTS)
     for part in (
-        "share       removes 97 % of the squared error; 48 % likely",
-        "corrections T is measured 2.00 ± 0.20 s after its stamp, C lags by 12 ± 2 s, volume 1.2 ± 0.4 %  (95 %)",
+        "share       removes 97 % of the squared error; 48 % likely against the other causes",
+        "corrected   T is measured 2.00 ± 0.20 s after its stamp, C lags by 12 ± 2 s, volume 1.2 ± 0.4 %, "
+        "qc acts 1.8 ± 0.6 s before its stamp relative to the outputs  (95 %)",
         "or          fouled jacket (heat_transfer, step): ",
         ", since 150.30 ± 0.20 min, which acts the same in this record",
         "next        wrong feed temperature (feed_temperature, step), which removes 41 % of the squared error; "
-        "less than 1 % likely",
+        "less than 1 % likely against the other causes",
     ):
         assert part in text
-    assert "BIC" not in text
     right = replace(CASES["inexact"], verdict="nominal", grade="right", causes=(), alternatives=())
     assert describe_verdict(right) == (
         "The simulation is right but for small corrections: T is measured 2.00 ± 0.20 s after its stamp, "
-        "C lags by 12 ± 2 s, volume 1.2 ± 0.4 %."
+        "C lags by 12 ± 2 s, volume 1.2 ± 0.4 %, qc acts 1.8 ± 0.6 s before its stamp relative to the outputs."
     )
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_evidence_is_stated_in_odds_or_per_cent(case: str) -> None:
+    assert "BIC" not in diagnosis_text(CASES[case], EFFECTS)
+
+
+@pytest.mark.parametrize(
+    ("profile", "expected"),
+    [("step", "from the beginning"), ("ramp", "growing from the beginning"), ("decay", "settling from the beginning")],
+)
+def test_a_cause_that_may_have_been_there_from_the_first_row_has_no_onset(profile: str, expected: str) -> None:
+    leak = replace(CASES["named"].causes[0], profile=profile, from_beginning=True)
+    assert describe_timing(leak) == expected
+    assert describe_timing(replace(leak, run=2)) == f"{expected} of run 2"
+
+
+def test_outputs_that_differ_in_practice_have_a_line_each_and_the_others_are_counted() -> None:
+    named = CASES["named"]
+    few = {"C": replace(named.differences["C"], tolerance=9.0)}
+    text = diagnosis_text(replace(named, differences=named.differences | few), EFFECTS)
+    assert re.findall("differs     (.*)", text) == [
+        "T by 1.54 K, 4 % of it noise; most from 149.9 to 174.9 min (3.04)",
+        "1 other output by less than matters in practice",
+    ]
 
 
 @pytest.mark.parametrize(
@@ -175,7 +208,7 @@ def test_a_sound_simulation_that_errs_by_more_than_the_noise_is_right_with_a_res
 
 
 def test_places_are_compared_with_the_best() -> None:
-    expected = "where       in the energy balance; on the side of the coolant, worse by 4.5 in BIC"
+    expected = "where       in the energy balance; on the side of the coolant, less likely by odds of 9.5 to 1"
     assert expected in diagnosis_text(CASES["law"], EFFECTS)
 
 
@@ -188,7 +221,8 @@ def test_an_unknown_lists_what_comes_nearest() -> None:
 
 def test_a_training_names_the_place_of_what_it_cannot_explain() -> None:
     assert describe_training(CASES["unknown"]) == (
-        "the training deviates from the equations in the energy balance, and no cause of the catalogue explains it"
+        "the training deviates from the equations, and no cause of the catalogue explains it; an unknown deviation of "
+        "a single place fits best in the energy balance (odds of over 100 to 1 against any other place)"
     )
 
 
@@ -216,7 +250,13 @@ def test_a_law_has_its_intervals_its_rivals_and_its_range() -> None:
     assert law["range"] == {"T": [425.0, 452.0]}
     assert law["held_out"]["T"]["rmse_after"] == 0.301
     text = diagnosis_text(CASES["law"], EFFECTS)
-    for part in ("a (T/440)^n", "4.1 ± 0.4", "425 to 452", "worse by 4.5 in BIC", "correlation 0.97 with Tf"):
+    for part in (
+        "a (T/440)^n",
+        "4.1 ± 0.4",
+        "425 to 452",
+        "less likely by odds of 9.5 to 1",
+        "correlation 0.97 with Tf",
+    ):
         assert part in text
 
 
