@@ -8,8 +8,7 @@ distribution (Sivia & Skilling 2006, Data Analysis: A Bayesian Tutorial, 2.2). T
 as likely as the maximum; the root mean square distance from the estimate is the standard deviation.
 
 Effects with internal states were screened at a few magnitudes only (`dynamic_and_pair_screens`). For their steps all
-onsets are evaluated at once: the states are fast, so before the onset the innovations are those of a filter without the
-effect, and after it those of one with the effect throughout.
+onsets are evaluated at once (`fitting.scan`), because the states are fast.
 
 Extended model: the model with the diagnosed causes, in the format of its file.
 """
@@ -25,9 +24,9 @@ from msgspec import structs
 
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.compiled_function import LANES
-from reactorwatch.diagnosis.fitting.fault_filter import huber_row_losses
 from reactorwatch.diagnosis.fitting.hypothesis import Fit
 from reactorwatch.diagnosis.fitting.profiles import Step
+from reactorwatch.diagnosis.fitting.scan import onset_losses
 from reactorwatch.diagnosis.result import AdjustedParameter, Cause, Estimate, make_cause
 from reactorwatch.diagnosis.run import Run
 from reactorwatch.diagnosis.search.search import FittedHypothesis, Search
@@ -106,9 +105,7 @@ def refine(
 def _leave_local_optimum(search: Search, best: FittedHypothesis, index: int) -> FittedHypothesis:
     """Try the onsets at which the innovations with the effect become better than those without it."""
     run, hypothesis = search.run, best.hypothesis
-    without = huber_row_losses(hypothesis.innovations_without(run, best.fit, index))
-    with_it = huber_row_losses(_evaluate(search, best, index, 1, float(run.time_min[0])).w)
-    total = np.cumsum(without) + np.cumsum(with_it[::-1])[::-1] - with_it
+    (total,) = onset_losses(run, hypothesis, best.fit, index, best.fit.parameters[index][:1])
     for _ in range(HOLLOWS):
         row = int(np.argmin(total))
         trial = _evaluate(search, best, index, 1, float(run.time_min[row]))

@@ -10,7 +10,13 @@ from reactorwatch.arrays import Array
 CONVERGED = 0.05
 """Gain in log likelihood below which a descent ends."""
 
-_TRIES, _DAMPING, _MORE_DAMPING, _LESS_DAMPING = 5, 1e-3, 10.0, 0.1
+DAMPING = 1e-3, 10.0
+"""Damping of the first step, as a fraction of the information, and its factor after a step without a gain."""
+
+NEARLY_LINEAR = 1e-6, 100.0
+"""The same for parameters in which the model is nearly linear, but which can imitate each other."""
+
+_TRIES, _LESS_DAMPING = 5, 0.1
 
 
 class Point(Protocol):
@@ -33,6 +39,7 @@ def descend(
     move: Callable[[P, Array], P | None],
     steps: int,
     enough: float = CONVERGED,
+    dampings: tuple[float, float] = DAMPING,
 ) -> P:
     """Descend from a point to one with a smaller loss.
 
@@ -43,8 +50,10 @@ def descend(
             diverges there.
         steps: maximum number of steps.
         enough: gain in log likelihood that is not worth a step.
+        dampings: damping of the first step, and its factor after a step without a gain.
     """
-    best, damping = start, _DAMPING
+    best, (first, more) = start, dampings
+    damping = first
     for _ in range(steps):
         known = equations(best)
         if known is None or not np.all(np.isfinite(known[0])):
@@ -62,9 +71,9 @@ def descend(
             if trial is not None and trial.loss < best.loss:
                 best, damping = trial, damping * _LESS_DAMPING
                 break
-            damping *= _MORE_DAMPING
+            damping *= more
         gained = before.loss - best.loss
         # A full step that gains what was predicted shows that the loss is quadratic here: nothing remains to gain.
-        if gained < CONVERGED or (damping < _DAMPING and abs(gained - promised) < enough):
+        if gained < CONVERGED or (damping < first and abs(gained - promised) < enough):
             break
     return best

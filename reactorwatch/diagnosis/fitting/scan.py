@@ -187,8 +187,9 @@ def search_coarse(run: Run, hypothesis: Hypothesis, best: Fit) -> Fit:
         best = _best_of(run, hypothesis, best, 0, [np.append(size, best.parameters[0][1:]) for size in sizes])
         return scan_sizes(run, hypothesis, best, 0, _NEARER)
     for tried in (sizes, best.parameters[0][0] * _ABOUT):
-        lost = zip(tried, _onset_losses(run, hypothesis, best, tried), strict=True)
-        best = _best_of(run, hypothesis, best, 0, [np.array([size, onsets[np.argmin(item)]]) for size, item in lost])
+        lost = zip(tried, onset_losses(run, hypothesis, best, 0, tried), strict=True)
+        likely = [np.array([size, onsets[np.argmin(item[run.input_changes[:-1]])]]) for size, item in lost]
+        best = _best_of(run, hypothesis, best, 0, likely)
     best = _best_onset(run, hypothesis, best, _likely_onsets(run, hypothesis, best))
     return scan_sizes(run, hypothesis, best, 0, _NEARER)
 
@@ -218,9 +219,9 @@ def search_fine(run: Run, hypothesis: Hypothesis, best: Fit) -> Fit:
 def _likely_onsets(run: Run, hypothesis: Hypothesis, best: Fit) -> Array:
     """Onsets worth fitting at the present magnitude, increasing."""
     onsets = _onset_grid(run)
-    (lost,) = _onset_losses(run, hypothesis, best, best.parameters[0][:1])
+    (lost,) = onset_losses(run, hypothesis, best, 0, best.parameters[0][:1])
     chosen = np.zeros(onsets.size, dtype=np.bool_)
-    chosen[np.argsort(lost)[:_LIKELY_ONSETS]] = True
+    chosen[np.argsort(lost[run.input_changes[:-1]])[:_LIKELY_ONSETS]] = True
     chosen[:: max(-(-onsets.size // _ALL_OVER), 1)] = True
     return onsets[chosen]
 
@@ -231,14 +232,14 @@ def _onset_grid(run: Run) -> Array:
     return np.asarray(0.5 * (run.time_min[moved] + run.time_min[moved + 1]))
 
 
-def _onset_losses(run: Run, hypothesis: Hypothesis, best: Fit, sizes: Array) -> list[Array]:
-    """Approximate loss of each candidate onset up to a constant, for each magnitude."""
-    never = huber_row_losses(hypothesis.innovations_without(run, best, 0))
-    tried = [np.array([size, run.time_min[0]]) for size in sizes]
+def onset_losses(run: Run, hypothesis: Hypothesis, best: Fit, index: int, sizes: Array) -> list[Array]:
+    """Approximate loss of a step of one effect after each row, up to a constant, for each magnitude."""
+    never = huber_row_losses(hypothesis.innovations_without(run, best, index))
+    tried = [np.array([size, run.time_min[0], *best.parameters[index][2:]]) for size in sizes]
     result = []
-    for item in hypothesis.evaluate_values(run, best, 0, tried, best):
+    for item in hypothesis.evaluate_values(run, best, index, tried, best):
         gained = never - huber_row_losses(item.w)
-        result.append(np.cumsum(gained)[run.input_changes[:-1]] - np.sum(gained))
+        result.append(np.cumsum(gained) - np.sum(gained))
     return result
 
 

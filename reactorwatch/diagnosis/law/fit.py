@@ -1,7 +1,7 @@
-"""Fit of a smooth correction inside the simulation, by damped Gauss-Newton steps from zero.
+"""Fit of a smooth correction inside the simulation, by damped Gauss-Newton steps (`fitting.descent`) from zero.
 
-Every step solves for all coefficients at once, and keeps those functions that lower the BIC (forward selection, then
-backward elimination, on the normal equations), so that a simple law is not beaten by a richer place.
+Every step keeps those functions that lower the BIC (forward selection, then backward elimination, on the normal
+equations), so that a simple law is not beaten by a richer place.
 """
 
 from collections.abc import Sequence
@@ -13,6 +13,7 @@ import numpy as np
 
 from reactorwatch.arrays import Array
 from reactorwatch.diagnosis.fitting.colored_noise import Noise
+from reactorwatch.diagnosis.fitting.descent import NEARLY_LINEAR, Equations, descend
 from reactorwatch.diagnosis.fitting.fault_filter import FaultFilter, FilterEvaluation
 from reactorwatch.diagnosis.fitting.simulation import FittedSimulation, linearize
 from reactorwatch.diagnosis.law.shapes import LARGEST, Shape
@@ -23,14 +24,9 @@ from reactorwatch.process.model import MODEL_CACHE_SIZE, Place
 MOST_TERMS = 6
 """Largest number of functions of a correction."""
 
-HALVINGS = 4
-CONVERGED = 0.5
-"""Gain in BIC below which a fit has converged."""
-
 _linearize_shape = lru_cache(maxsize=MODEL_CACHE_SIZE)(linearize)  # shapes are made once for a model and a place
 
 _RIDGE = 1e-9
-_RUNAWAY = 1e100
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,6 +46,11 @@ class ShapeFit:
     coefficients: Array
     evaluation: FilterEvaluation
     bic: float
+
+    @property
+    def loss(self) -> float:
+        """Half of the BIC, which a fit lowers."""
+        return 0.5 * self.bic
 
     @property
     def shape(self) -> Shape:
@@ -103,21 +104,25 @@ class ShapeFitter:
             first: run of the filter at the initial coefficients, if it is known.
         """
         self._simulation.ekf.noise = noise
-        best = self.evaluate(start, select) if first is None else self._fit_of(start, first, select)
-        for _ in range(steps):
-            target = self._target(best, select)
-            if target is None:
-                break
-            before = best
-            change = target - best.coefficients
-            for halving in range(HALVINGS):
-                trial = self.evaluate(best.coefficients + change * 0.5**halving if halving else target, select)
-                if trial.bic < best.bic:
-                    best = trial
-                    break
-            if before.bic - best.bic < CONVERGED:
-                break
-        return best
+        dropped = np.full(start.size, select)
+
+        def equations(fit: ShapeFit) -> Equations:
+            information, gradient = self.normal_equations(fit)
+            if select and np.all(np.isfinite(information)):
+                by = gradient + information @ fit.coefficients
+                dropped[:] = True
+                dropped[select_terms(information, by, log(self._run.values))] = False
+                # A function that is not worth its charge goes back to zero, independently of all others.
+                separate = np.logical_or.outer(dropped, dropped)
+                information = np.where(separate, np.diag(np.diag(information)), information)
+                gradient = np.where(dropped, 0.0, by) - information @ fit.coefficients
+            return information, gradient
+
+        def move(fit: ShapeFit, step: Array) -> ShapeFit:
+            return self.evaluate(np.where(dropped, 0.0, fit.coefficients + step), select)
+
+        point = self.evaluate(start, select) if first is None else self._fit_of(start, first, select)
+        return descend(point, equations, move, steps, dampings=NEARLY_LINEAR)
 
     def dynamics(self, fit: ShapeFit, further: Sequence[str] = ()) -> ErrorDynamics:
         """Error equations about a fit, for its coefficients and further parameters of the model."""
@@ -138,17 +143,6 @@ class ShapeFitter:
         values = np.clip(self._first + coefficients, -LARGEST, LARGEST)
         return {**self.shape.scales, **dict(zip(self.shape.parameters, values.tolist(), strict=True))}
 
-    def _target(self, fit: ShapeFit, select: bool) -> Array | None:
-        information, gradient = self.normal_equations(fit)
-        if not np.all(np.isfinite(information)) or np.max(np.abs(information)) > _RUNAWAY:
-            return None
-        by = gradient + information @ fit.coefficients
-        chosen = select_terms(information, by, log(self._run.values)) if select else list(range(by.size))
-        result = np.zeros(by.size)
-        if chosen:
-            result[chosen] = _solve(information, by, chosen)[0]
-        return result
-
 
 def select_terms(information: Array, by: Array, charge: float) -> list[int]:
     """Functions that lower the BIC most: forward selection, then backward elimination.
@@ -160,7 +154,7 @@ def select_terms(information: Array, by: Array, charge: float) -> list[int]:
     """
     remaining, chosen, gain = set(np.flatnonzero(np.diag(information) > 0.0).tolist()), list[int](), 0.0
     while remaining and len(chosen) < MOST_TERMS:
-        gains = {item: _solve(information, by, [*chosen, item])[1] for item in remaining}
+        gains = {item: _gain(information, by, [*chosen, item]) for item in remaining}
         best = max(gains, key=lambda item: gains[item])
         if gains[best] - gain < charge:
             break
@@ -168,7 +162,7 @@ def select_terms(information: Array, by: Array, charge: float) -> list[int]:
         chosen.append(best)
         remaining.remove(best)
     while len(chosen) > 1:
-        without = {item: _solve(information, by, [other for other in chosen if other != item])[1] for item in chosen}
+        without = {item: _gain(information, by, [other for other in chosen if other != item]) for item in chosen}
         worst = max(without, key=lambda item: without[item])
         if gain - without[worst] > charge:
             break
@@ -177,9 +171,9 @@ def select_terms(information: Array, by: Array, charge: float) -> list[int]:
     return sorted(chosen)
 
 
-def _solve(information: Array, by: Array, chosen: Sequence[int]) -> tuple[Array, float]:
-    """Coefficients of some functions, and by how much they lower twice the loss."""
+def _gain(information: Array, by: Array, chosen: Sequence[int]) -> float:
+    """Reduction of twice the loss by some functions."""
     inner, right = information[np.ix_(chosen, chosen)], by[list(chosen)]
     scale = np.sqrt(np.maximum(np.diag(inner), 1e-300))
     scaled = np.linalg.solve(inner / np.outer(scale, scale) + _RIDGE * np.eye(scale.size), right / scale)
-    return scaled / scale, float(right @ (scaled / scale))
+    return float(right @ (scaled / scale))

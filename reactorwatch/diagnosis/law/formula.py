@@ -9,11 +9,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations, permutations
 from math import log
+from typing import NamedTuple
 
 import numpy as np
 
 from reactorwatch.arrays import Array
 from reactorwatch.diagnosis.fitting import signatures
+from reactorwatch.diagnosis.fitting.descent import Equations, descend
 from reactorwatch.diagnosis.fitting.fault_filter import huber_weights
 from reactorwatch.diagnosis.fitting.profiles import hat_functions
 from reactorwatch.diagnosis.law.fit import ShapeFit
@@ -51,15 +53,13 @@ POSITIONS = (-1.0, 0.0, 1.0)
 """Initial positions, in spreads from the mean."""
 
 _DIFFERENCE = 1e-4
-_CONVERGED = 0.01
-_DAMPINGS = (1e-6, 1e-2, 1.0, 100.0)
 
 
 class FormulaSearch:
     """Fits forms about the path of a smooth correction.
 
-    A correction is represented by its values at knots of its variables, between which it is linear, so that twice the
-    loss is a quadratic form of these values and a form is fitted in well under a millisecond.
+    A correction is represented by its values at knots of its variables, between which it is linear, so that the loss
+    is a quadratic form of these values and a form is fitted in well under a millisecond.
 
     Args:
         fit: fit of the correction.
@@ -111,7 +111,7 @@ class FormulaSearch:
         variables = dict(zip(names, points, strict=True))
         means = {name: float(np.mean(item)) for name, item in zip(names, values, strict=True)}
         spreads = {name: float(np.std(item)) for name, item in zip(names, values, strict=True)}
-        return _Grid(variables, means, spreads, g.T @ g, g.T @ target, float(target @ target))
+        return _Grid(variables, means, spreads, g.T @ g, g.T @ target, 0.5 * float(target @ target))
 
     def _response(self, columns: Array) -> Array:
         """Reduction of the innovations by courses of the correction, shape (values, columns).
@@ -134,11 +134,11 @@ class FormulaSearch:
         fitter = _FormFitter(form, names, grid)
         if form.positive and min(float(np.min(item)) for item in fitter.values) <= 0.0:
             return None
-        starts = sorted((fitter.start(item) for item in fitter.starts()), key=lambda item: item[0])[:MOST_STARTS]
-        loss, p = min((fitter.fit(*item) for item in starts), key=lambda item: item[0])
-        if not (np.isfinite(loss) and fitter.is_in_bounds(p)):
+        starts = sorted((fitter.start(item) for item in fitter.starts()), key=lambda item: item.loss)[:MOST_STARTS]
+        best = min((fitter.fit(item) for item in starts), key=lambda item: item.loss)
+        if not (np.isfinite(best.loss) and fitter.is_in_bounds(best.p)):
             return None
-        parameters = {item.name: float(value) for item, value in zip(form.parameters, p, strict=True)}
+        parameters = {item.name: float(value) for item, value in zip(form.parameters, best.p, strict=True)}
         if self._place.apart:
             parameters[APART] = self._ratio
         if self._place.lag_min:
@@ -146,19 +146,19 @@ class FormulaSearch:
         values = [self._variables[name] for name in names]
         ranges = {name: (float(np.min(item)), float(np.max(item))) for name, item in zip(names, values, strict=True)}
         law = ExtendedLaw(self._place.name, form.key, tuple(names), tuple(fitter.references), parameters, ranges)
-        return loss + len(parameters) * self._charge, law
+        return 2.0 * best.loss + len(parameters) * self._charge, law
 
 
 @dataclass(frozen=True, eq=False)
 class _Grid:
-    """Twice the loss as a quadratic form of the correction's values at the knots.
+    """The loss as a quadratic form of the correction's values at the knots.
 
     Attributes:
         variables: values of each variable at the knots, shape (knots,).
         means: mean of each variable along the path.
         spreads: standard deviation of each variable along the path.
-        information: curvature of twice the loss, halved, shape (knots, knots).
-        gradient: minus half its slope where the correction is zero, shape (knots,).
+        information: curvature of the loss, shape (knots, knots).
+        gradient: minus its slope where the correction is zero, shape (knots,).
         constant: its value where the correction is zero.
     """
 
@@ -170,14 +170,22 @@ class _Grid:
     constant: float
 
     def loss(self, course: Array) -> float:
-        """Twice the loss; infinite where the course is not finite."""
+        """The loss; infinite where the course is not finite."""
         if not np.all(np.isfinite(course)):
             return float("inf")
-        return float(self.constant - 2.0 * self.gradient @ course + course @ self.information @ course)
+        return float(self.constant - self.gradient @ course + 0.5 * course @ self.information @ course)
+
+
+class _FittedForm(NamedTuple):
+    """Parameters of a form, with its course at the knots and its loss."""
+
+    p: Array
+    course: Array
+    loss: float
 
 
 class _FormFitter:
-    """Fits a form of some variables to the values at the knots; losses are twice the negative log likelihood."""
+    """Fits a form of some variables to the values at the knots."""
 
     def __init__(self, form: Form, names: Sequence[str], grid: _Grid) -> None:
         self._form, self._grid = form, grid
@@ -201,8 +209,8 @@ class _FormFitter:
             starts = [np.array([*start[:index], option, *start[index + 1 :]]) for start in starts for option in options]
         return starts
 
-    def start(self, start: Array) -> tuple[float, Array]:
-        """Loss and parameters, of which the linear ones are fitted."""
+    def start(self, start: Array) -> _FittedForm:
+        """Fit the linear parameters."""
         linear = [i for i, item in enumerate(self._form.parameters) if item.kind in (GAIN, SLOPE, CURVATURE)]
         columns = []
         with np.errstate(over="ignore", invalid="ignore"):
@@ -212,32 +220,20 @@ class _FormFitter:
                 columns.append(self._course(unit))
             g, p = np.column_stack(columns), start.copy()
             p[linear] = np.linalg.lstsq(g.T @ self._grid.information @ g, g.T @ self._grid.gradient, rcond=1e-12)[0]
-            return self._grid.loss(self._course(p)), p
+            return self._evaluate(p)
 
-    def fit(self, best: float, p: Array) -> tuple[float, Array]:
-        """Loss and parameters, by damped Gauss-Newton steps from a start."""
-        grid = self._grid
+    def fit(self, start: _FittedForm) -> _FittedForm:
+        """Fit all parameters from a start."""
         with np.errstate(over="ignore", invalid="ignore"):
-            course = self._course(p)
-            for _ in range(STEPS):
-                if not np.isfinite(best):
-                    break
-                columns = np.column_stack([self._slope(p, i) for i in range(p.size)])
-                size = np.sqrt(np.maximum(np.sum(columns * (grid.information @ columns), axis=0), 1e-300))
-                columns = columns / size
-                information = columns.T @ grid.information @ columns
-                gradient = columns.T @ (grid.gradient - grid.information @ course)
-                before = best
-                for damping in _DAMPINGS:
-                    trial = p + np.linalg.solve(information + damping * np.eye(p.size), gradient) / size
-                    moved = self._course(trial)
-                    loss = grid.loss(moved)
-                    if loss < best:
-                        p, best, course = trial, loss, moved
-                        break
-                if before - best < _CONVERGED:
-                    break
-        return best, p
+            return descend(start, self._normal_equations, lambda fit, step: self._evaluate(fit.p + step), STEPS)
+
+    def _normal_equations(self, fit: _FittedForm) -> Equations:
+        columns, grid = np.column_stack([self._slope(fit.p, i) for i in range(fit.p.size)]), self._grid
+        return columns.T @ grid.information @ columns, columns.T @ (grid.gradient - grid.information @ fit.course)
+
+    def _evaluate(self, p: Array) -> _FittedForm:
+        course = self._course(p)
+        return _FittedForm(p, course, self._grid.loss(course))
 
     def _slope(self, p: Array, i: int) -> Array:
         """Derivative of the course by a parameter."""
