@@ -13,6 +13,7 @@ again from the residual of the best; the model is then linearised again about it
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import exp
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +26,6 @@ from reactorwatch.diagnosis.inexact.hypotheses import (
     CONSTANT,
     CURVE,
     NONE,
-    ONSETS,
     RAMP,
     STEP,
     WIDTH,
@@ -35,7 +35,7 @@ from reactorwatch.diagnosis.inexact.hypotheses import (
 from reactorwatch.diagnosis.inexact.noise import Discrepancy, estimate_discrepancy, white, white_noise_sd
 from reactorwatch.diagnosis.inexact.nuisance import Nuisance
 from reactorwatch.diagnosis.inexact.screen import Screen
-from reactorwatch.diagnosis.inexact.simulation import InexactSimulation, ProductForcing, Simulated
+from reactorwatch.diagnosis.inexact.simulation import InexactSimulation, ProductForcing, Simulated, Slopes
 from reactorwatch.diagnosis.run import Run
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.model import ProcessModel
@@ -129,6 +129,24 @@ def explain(
     return _Comparison(model, effects, run, starts, stated, np.asarray(smallest_sd)).run_rounds()
 
 
+class _Linear(NamedTuple):
+    """A model linearised about a simulation.
+
+    Attributes:
+        theta: nuisance of the simulation, shape (size,).
+        residual: residual at the kept rows, 0 where not measured, shape (kept rows, n_y).
+        base: derivatives of the readings by all nuisance, shape (kept rows, n_y, size).
+        causes: derivatives by every effect in all steps, then hats, shape (kept rows, n_y, effects * courses).
+        slopes: derivatives along the simulation.
+    """
+
+    theta: Array
+    residual: Array
+    base: Array
+    causes: Array
+    slopes: Slopes
+
+
 class _Comparison:
     """The rounds of `explain`, whose arguments it takes."""
 
@@ -174,7 +192,11 @@ class _Comparison:
         noise = white(np.maximum(np.sqrt(np.mean(residual**2, axis=0)), self._smallest_sd))
         for number in range(1, ROUNDS + 1):
             report_stage("comparing with nuisance, round", number, ROUNDS + 1)
-            fits = self._fit_all(_choose_first(self._rank(theta, simulated, noise)), theta, noise, slow=True)
+            linear = self._linearise(theta, simulated)
+            fits = self._fit_all(_choose_first(self._rank(linear, noise)), theta, noise, slow=True)
+            if number == 1:  # a sensor's jump stands out of what wanders, where that is no white noise
+                coloured = estimate_discrepancy(residual, self._smallest_sd)
+                fits += self._fit_all(_choose_first(self._rank(linear, coloured)), theta, coloured)
             if not fits:
                 return None
             best, noise = max(
@@ -191,11 +213,11 @@ class _Comparison:
                 return None
             simulated = again
         report_stage("comparing with nuisance, round", ROUNDS + 1, ROUNDS + 1)
-        fits = self._fit_all(_choose(self._rank(theta, simulated, noise), LAST), theta, noise)
+        fits = self._fit_all(_choose(self._rank(self._linearise(theta, simulated), noise), LAST), theta, noise)
         return self._explanations(fits, noise) if any(item.hypothesis.kind == NONE for item in fits) else None
 
-    def _rank(self, theta: Array, simulated: Simulated, noise: Discrepancy) -> list[Hypothesis]:
-        """All hypotheses by the model linearised about a simulation."""
+    def _linearise(self, theta: Array, simulated: Simulated) -> "_Linear":
+        """Derivatives of the readings at the kept rows about a simulation."""
         sim, nuisance = self._simulation, self._nuisance
         found = nuisance.linearise(theta, simulated)
         steps, hats = self._courses.steps(), self._courses.hats()
@@ -204,27 +226,30 @@ class _Comparison:
         )
         starts = np.zeros((len(sim.begins), len(sim.model.states), len(sim.effects) * courses.interval_mean.shape[1]))
         causes = nuisance.derivatives(theta, found.slopes, starts, ProductForcing(courses))
-        whitened = noise.whiten(self._fitter.residual(theta, simulated))
-        base, causes = (noise.whiten(self._fitter.mask(item)) for item in (found.derivatives, causes))
+        residual, mask = self._fitter.residual(theta, simulated), self._fitter.mask
+        return _Linear(theta, residual, mask(found.derivatives), mask(causes), found.slopes)
+
+    def _rank(self, linear: "_Linear", noise: Discrepancy) -> list[Hypothesis]:
+        """All hypotheses by the linearised model, the likeliest first."""
+        sim, nuisance, slopes = self._simulation, self._nuisance, linear.slopes
+        whitened, base, causes = (noise.whiten(item) for item in (linear.residual, linear.base, linear.causes))
         values = whitened.size
         screen = Screen(
             nuisance,
             self._courses,
             self._widths,
-            theta,
+            linear.theta,
             whitened.ravel(),
             base.reshape(values, -1),
             causes.reshape(values, len(sim.effects), -1),
         )
-        ranked = screen.rank()
-        for effect in np.flatnonzero(~np.any(found.slopes.b, axis=(0, 1))).tolist():  # errors of sensors
-            about = next(item.onset for item in ranked if item.cause == (STEP, effect))
-            near = np.abs(self._run.time_min - about) <= self._courses.span_min / ONSETS
-            onsets = self._run.time_min[near]
-            jumps = self._run.time_min[self._rows, None] >= onsets
-            columns = found.slopes.d[self._rows, :, effect, None] * jumps[:, None, :]
-            whitened_jumps = noise.whiten(self._fitter.mask(columns)).reshape(values, -1)
-            ranked = screen.refine(ranked, effect, onsets, whitened_jumps)
+        ranked, times = screen.rank(), self._run.time_min[self._rows]
+        for effect in np.flatnonzero(~np.any(slopes.b, axis=(0, 1))).tolist():  # errors of sensors
+            shows = np.any(slopes.d[:, :, effect], axis=0)
+            columns = slopes.d[self._rows, :, effect, None] * (times[:, None] >= times)[:, None, :]
+            jumps = noise.of(shows).whiten(self._fitter.mask(columns)[:, shows])
+            given = np.tile(shows, len(times))
+            ranked = screen.refine(ranked, effect, times, jumps.reshape(-1, times.size), given)
         return ranked
 
     def _fit_all(

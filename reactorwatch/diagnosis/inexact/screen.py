@@ -13,6 +13,7 @@ from collections.abc import Iterator, Sequence
 from math import log
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 
 from reactorwatch.arrays import Array
@@ -72,19 +73,22 @@ class Screen:
         found = (item for prior in self._nuisance.priors for item in self._with_prior(prior))
         return sorted(found, key=lambda item: -item.log_evidence)
 
-    def refine(self, ranked: Sequence[Hypothesis], effect: int, onsets: Array, steps: Array) -> list[Hypothesis]:
-        """The same hypotheses, those with a step of an effect that has its columns at each row, the likeliest first.
+    def refine(
+        self, ranked: Sequence[Hypothesis], effect: int, onsets: Array, steps: Array, given: NDArray[np.bool_]
+    ) -> list[Hypothesis]:
+        """The same hypotheses, those with a step of an effect at the best of other onsets, the likeliest first.
 
         A sensor's step jumps: at the nearest of the onsets of all causes it may leave a pulse of many rows.
 
         Args:
-            ranked: hypotheses by all onsets.
+            ranked: hypotheses by the onsets of all causes.
             effect: index of the effect.
-            onsets: one for each row about the likeliest, shape (n,).
-            steps: whitened derivatives by the steps, shape (values, n).
+            onsets: equally likely, shape (n,).
+            steps: whitened derivatives by the steps, shape (given values, n).
+            given: values on which they act, shape (values,).
         """
-        rows = self._courses.time_min.size
-        ff, fr, bf = np.einsum("ij,ij->j", steps, steps), steps.T @ self._residual, self._base.T @ steps
+        ff, fr = np.einsum("ij,ij->j", steps, steps), steps.T @ self._residual[given]
+        bf = self._base[given].T @ steps
         width, result = WIDTH * float(self._nuisance.simulation.typical[effect]), []
         for item in ranked:
             if item.cause == (STEP, effect):
@@ -92,7 +96,7 @@ class Screen:
                 with_base = solve_triangular(lower, self._nuisance.sds(item.prior)[:, None] * bf, lower=True)
                 gain, sizes = _gains(ff, fr, with_base, z, width)
                 best = int(np.argmax(gain))
-                evidence = none + gain[best] + log(float(np.sum(np.exp(gain - gain[best]))) / rows)
+                evidence = none + gain[best] + log(float(np.mean(np.exp(gain - gain[best]))))
                 item = item._replace(onset=float(onsets[best]), size=float(sizes[best]), log_evidence=float(evidence))
             result.append(item)
         return sorted(result, key=lambda item: -item.log_evidence)
