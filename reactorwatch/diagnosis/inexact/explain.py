@@ -193,10 +193,12 @@ class _Comparison:
         for number in range(1, ROUNDS + 1):
             report_stage("comparing with nuisance, round", number, ROUNDS + 1)
             linear = self._linearise(theta, simulated)
-            fits = self._fit_all(_choose_first(self._rank(linear, noise)), theta, noise, slow=True)
+            ranked = self._rank(linear, noise)
+            chosen = _choose_first(ranked)
             if number == 1:  # a sensor's jump stands out of what wanders, where that is no white noise
                 coloured = estimate_discrepancy(residual, self._smallest_sd)
-                fits += self._fit_all(_choose_first(self._rank(linear, coloured)), theta, coloured)
+                chosen = _add_causes(chosen, ranked, _choose_first(self._rank(linear, coloured)))
+            fits = self._fit_all(chosen, theta, noise, slow=True)
             if not fits:
                 return None
             best, noise = max(
@@ -365,6 +367,18 @@ def _choose_first(ranked: Sequence[Hypothesis]) -> list[Hypothesis]:
         if is_open and not any(_seem_the_same(item, other) for other in chosen):
             chosen.append(item)
     return [next(item for item in ranked if item.kind == NONE), *chosen]
+
+
+def _add_causes(
+    chosen: Sequence[Hypothesis], ranked: Sequence[Hypothesis], others: Sequence[Hypothesis]
+) -> list[Hypothesis]:
+    """Hypotheses, and those of a ranking with the causes and courses of others."""
+    result = list(chosen)
+    for other in others:
+        if not any(_seem_the_same(other, item) for item in chosen):
+            same = next(item for item in ranked if item.cause == other.cause)
+            result.append(same._replace(onset=other.onset, size=other.size))
+    return result
 
 
 def _seem_the_same(one: Hypothesis, other: Hypothesis) -> bool:
