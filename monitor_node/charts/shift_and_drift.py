@@ -22,8 +22,8 @@ import numpy as np
 
 from monitor_node.alarms.alarms import AlarmChange, ChartAlarm
 from monitor_node.alarms.annunciator import Annunciator
+from monitor_node.charts.chart_design import ALL
 from monitor_node.charts.charts import chart_point
-from monitor_node.checks.base import PLANT
 from monitor_node.config import MonitorConfig
 from monitor_node.ingest.alignment import MeasuredRow
 from monitor_node.learn.arx import JUDGING_FORGETTING, ArxPredictor, arx_structure
@@ -139,8 +139,8 @@ class ChangeWatch:
         self._alarm: ChartAlarm | None = None
         if not config.inputs:
             # a change in an incident belongs to it, and says nothing of its cause
-            self._alarm = board.declare(CHANGE, PLANT, without_on_delay=True, without_off_delay=True, is_transient=True)
-        self._key = keys.key(config.plant, keys.CHART, keys.chart_name(CHANGE, PLANT))
+            self._alarm = board.declare(CHANGE, ALL, without_on_delay=True, without_off_delay=True, is_transient=True)
+        self._key = keys.key(config.plant, keys.CHART, keys.chart_name(CHANGE, ALL))
         self.memory: LevelChange | None = None
 
     def start(self, values: Array) -> None:

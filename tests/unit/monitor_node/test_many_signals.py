@@ -95,7 +95,7 @@ def test_the_end_of_an_anomaly_is_an_event_of_the_same_incident(ends: bool) -> N
     values[2, first:end] += 8.0 * values[2, :TRAINING].std()
     whole = Monitor(settings(), 0)
     said = watch(whole, values)
-    changes = [alarm for alarm in raised(said) if alarm.alarm == "change/plant"]
+    changes = [alarm for alarm in raised(said) if alarm.alarm == "change/all"]
     assert len(changes) == ends
     if ends:
         (change,) = changes
