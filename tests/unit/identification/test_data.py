@@ -110,7 +110,7 @@ def test_equal_delays_of_the_inputs_are_one_delay() -> None:
     assert msgspec.structs.replace(Structure(2, 2, (1, 3), 2), inputs=0).history == 2
     with pytest.raises(InputError, match=r"one delay for each of 2 inputs, got \(1, 2, 3\)"):
         Structure(2, 2, (1, 2, 3), 2)
-    with pytest.raises(InputError, match="delay .* at least 1, got 0"):
+    with pytest.raises(InputError, match=r"delay .* at least 1, got 0"):
         Structure(2, 2, (4, 0), 2)
 
 
