@@ -140,14 +140,14 @@ def fit_black_box(
             f"{ROWS_A_PARAMETER * (1 + count + inputs.shape[1])} complete rows in succession and at most "
             f"{MOST_PARAMETERS} parameters, got {len(y)} rows"
         )
-    return _judge_held_out(best[2], (inputs, outputs, follows), (y, u, smallest))
+    return _with_error_ratio(best[2], (inputs, outputs, follows), (y, u, smallest))
 
 
 BLOCKS = 5
 """Blocks of the training, as in the other cross-validations of a training (`spc.charts.value_chart`)."""
 
 
-def _judge_held_out(
+def _with_error_ratio(
     model: BlackBoxModel, rows: tuple[Array, Array, NDArray[np.bool_]], scaled: tuple[Array, Array, Array]
 ) -> BlackBoxModel:
     """The model with its error ratio; see the fifth step of the module.
