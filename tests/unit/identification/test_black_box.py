@@ -275,7 +275,7 @@ def test_a_coefficient_whose_variance_rounding_made_negative_is_not_determined()
     assert damaged.dynamics_sd == inf
 
 
-def test_held_out_blocks_tell_a_model_that_is_wrong_from_one_that_is_right() -> None:
+def test_held_out_blocks_separate_a_wrong_model_from_a_right_one() -> None:
     """A quadratic plant is described but for its noise; a plant with jumps of its slope is not, and has no noise."""
     model, inputs, _ = trained()
     assert model.error_ratio <= 2.0
