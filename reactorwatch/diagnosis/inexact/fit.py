@@ -37,6 +37,10 @@ STEPS = 8
 FARTHEST = 2.0
 """Radius of the trust region in standard deviations of the priors: further away the derivatives are others."""
 
+DIVERGED = 1e12
+"""Residual in standard deviations from which on a simulation has left the record for good; squares of products of its
+derivatives are still numbers."""
+
 LIKELY = 3.0
 """Distance in standard deviations of its prior within which a fit starts."""
 
@@ -214,6 +218,8 @@ class _Fit:
         residual = self._fitter.residual(theta, simulated)
         residual = residual - self._moves_effect(theta)
         white = self._noise.whiten(residual)
+        if not np.all(np.abs(white) < DIVERGED):
+            return None
         loss = 0.5 * float(np.sum(white**2)) + 0.5 * float(np.sum((theta / self._sds) ** 2))
         centred = own / self._own_sds if not self._is_timed else own[:1] / self._own_sds[:1]
         return _Point(theta, own, loss + 0.5 * float(np.sum(centred**2)), residual, white, simulated)

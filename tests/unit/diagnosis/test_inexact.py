@@ -1,5 +1,6 @@
 """Explanations with nuisance: derivatives, evidence, and two heaters that are not quite their model."""
 
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from types import SimpleNamespace
@@ -21,8 +22,9 @@ from reactorwatch.diagnosis.fitting.descent import Equations, descend
 from reactorwatch.diagnosis.fitting.profiles import Signal
 from reactorwatch.diagnosis.inexact.answer import relative_delays
 from reactorwatch.diagnosis.inexact.explain import Explained, Explanation, explain
-from reactorwatch.diagnosis.inexact.hypotheses import CONSTANT, STEP, WIDTH, Courses
-from reactorwatch.diagnosis.inexact.noise import estimate_discrepancy
+from reactorwatch.diagnosis.inexact.fit import Fitter
+from reactorwatch.diagnosis.inexact.hypotheses import CONSTANT, NONE, STEP, WIDTH, Courses, Hypothesis
+from reactorwatch.diagnosis.inexact.noise import estimate_discrepancy, white
 from reactorwatch.diagnosis.inexact.nuisance import Nuisance, Prior
 from reactorwatch.diagnosis.inexact.screen import Screen
 from reactorwatch.diagnosis.inexact.simulation import InexactSimulation, ProductForcing
@@ -205,6 +207,18 @@ def test_a_descent_ends_where_its_equations_cannot_be_solved(known: float | None
         return None if known is None else (np.array([[known, 0.0], [0.0, 1.0]]), np.ones(2))
 
     assert descend(start, equations, lambda point, step: None, 5) is start
+
+
+def test_a_simulation_that_has_left_the_record_is_no_fit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of an unstable plant it may end in numbers whose squares are none."""
+    _, run, nuisance = plant()
+    simulated, theta = nuisance.simulate(np.zeros(nuisance.size)), np.zeros(nuisance.size)
+    assert simulated is not None
+    far = replace(simulated, true=1e200 * (1.0 + simulated.true))
+    monkeypatch.setattr(nuisance, "simulate", lambda *_: far)
+    measured = run.measured[nuisance.simulation.rows]
+    fitter = Fitter(nuisance, Courses(TIME, PERIOD_MIN), {}, measured)
+    assert fitter.fit(Hypothesis(NONE, -1, nuisance.priors[0]), theta, white(np.ones(measured.shape[1]))) is None
 
 
 def test_without_effects_there_is_no_explanation() -> None:
