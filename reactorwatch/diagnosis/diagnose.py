@@ -27,7 +27,7 @@ from reactorwatch.diagnosis.search.screen import Part
 from reactorwatch.diagnosis.search.search import smallest_noise
 from reactorwatch.diagnosis.whiteness import DOUBTFUL
 from reactorwatch.process import effects_of
-from reactorwatch.process.effect import Effect
+from reactorwatch.process.effect import TIMING, Effect
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.profiles import CONSTANT, FREE_NAME
 from reactorwatch.process.signal_effects import InputDelay, InputLag, OutputDelay, OutputLag
@@ -89,6 +89,8 @@ def diagnose(
 def _calls_for_nuisance(diagnosis: Diagnosis, exact: Exact, model: ProcessModel) -> bool:
     """True if the hypotheses are to be compared with nuisance: nothing simple explains the record to the noise."""
     best, is_white = exact.best, all(item.minus_log10_p < DOUBTFUL for item in diagnosis.adequacy.values())
+    if diagnosis.location == TIMING:
+        return False  # an integrator's steps are named, and nuisance would imitate them
     if diagnosis.verdict == UNKNOWN:
         return diagnosis.practical or diagnosis.law is None or not is_white
     is_pair = len(best.label) > 1
