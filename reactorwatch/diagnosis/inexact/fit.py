@@ -37,10 +37,6 @@ STEPS = 8
 FARTHEST = 2.0
 """Radius of the trust region in standard deviations of the priors: further away the derivatives are others."""
 
-DIVERGED = 1e12
-"""Residual in standard deviations from which on a simulation has left the record for good; squares of products of its
-derivatives are still numbers."""
-
 LIKELY = 3.0
 """Distance in standard deviations of its prior within which a fit starts."""
 
@@ -86,10 +82,9 @@ class Fitted:
 
     def log_evidence_with(self, discrepancy: Discrepancy) -> float:
         """The same with another discrepancy, the parameters and their share of the evidence as they are."""
-        values, result = np.count_nonzero(self.residual, axis=0), self.log_evidence
-        for sign, noise in ((1.0, self.discrepancy), (-1.0, discrepancy)):
-            result += sign * float(values @ np.log(noise.sd) + 0.5 * np.sum(noise.whiten(self.residual) ** 2))
-        return result
+        values, white = np.count_nonzero(self.residual, axis=0), discrepancy.whiten(self.residual)
+        gained = values @ np.log(self.discrepancy.sd / discrepancy.sd)
+        return self.log_evidence + float(gained + 0.5 * (np.sum(self.white_residual**2) - np.sum(white**2)))
 
     def residual_without(self, hidden: NDArray[np.bool_]) -> Array:
         """Residual at these of the kept rows of a fit to the others, by the derivatives of this fit."""
@@ -218,8 +213,6 @@ class _Fit:
         residual = self._fitter.residual(theta, simulated)
         residual = residual - self._moves_effect(theta)
         white = self._noise.whiten(residual)
-        if not np.all(np.abs(white) < DIVERGED):
-            return None
         loss = 0.5 * float(np.sum(white**2)) + 0.5 * float(np.sum((theta / self._sds) ** 2))
         centred = own / self._own_sds if not self._is_timed else own[:1] / self._own_sds[:1]
         return _Point(theta, own, loss + 0.5 * float(np.sum(centred**2)), residual, white, simulated)
