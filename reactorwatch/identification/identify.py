@@ -320,7 +320,8 @@ def _check_rows(structure: Structure, form: ModelForm, fitted: Dataset, held_out
     if fitted.rows <= least:
         raise UnfitRecordError(
             f"order {form.order} with delay {max(structure.delays, default=1)} needs more than {least} rows to fit, "
-            f"the first half of the record unless another validates, got {fitted.rows}; lower the order, or record for longer"
+            f"the first half of the record unless another validates, got {fitted.rows}; "
+            "lower the order, or record for longer"
         )
     if settle < 0:
         raise InputError(f"settle must be at least 0 rows, got {settle}")
