@@ -289,11 +289,16 @@ class _Choice:
         if not is_clean and not any(item.refused for item in screenings):
             kept = np.column_stack([item.usable for item in screenings]) | ~np.isfinite(z)
             again = fit(rows._replace(outputs=np.where(kept, rows.outputs, np.nan)))
-            if not (reference.errs and again[0].errs):
+            if not (reference.errs and (again[0].errs or _largest_correlation(again[1]) > 0.3)):
                 return _Candidate(*again, screenings)
         if reference.errs:  # what looks disturbed are its errors
             screenings = _unscreened(z)
         return _Candidate(reference, z, screenings)
+
+
+def _largest_correlation(z: Array) -> float:
+    """Largest correlation of a residual with that of the row before: about 0 for noise, 0.5 and more for errors."""
+    return max(float(np.nanmean(column[1:] * column[:-1]) / np.nanmean(column**2)) for column in z.T)
 
 
 def _unscreened(z: Array) -> list[Screening]:
