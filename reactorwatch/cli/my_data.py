@@ -162,8 +162,12 @@ def identify(
     model: Annotated[str, Option(help="arx, oe, armax, bj (Box-Jenkins), narx or noe (polynomials).")] = "arx",
     order: Annotated[int, Option(help="Lags of the output, each input and the disturbance.")] = 3,
     delay: Annotated[
-        str, Option(help="Samples from a move of an input to its first effect: N, auto (searched), or u1=3,u2=15.")
-    ] = "1",
+        str | None,
+        Option(
+            help="Samples from a move of an input to its first effect: N, auto (searched), or u1=3,u2=15 [1; with "
+            "--compare auto, beside 1]."
+        ),
+    ] = None,
     validate: Annotated[
         Path | None, Option(help="A record to validate on; all of FILE is then fitted [the second half].")
     ] = None,
@@ -191,7 +195,7 @@ def identify(
     form = ModelForm(
         model,
         order,
-        identification.read_delay(delay),
+        identification.read_delay(delay or "1"),
         recursive=recursive,
         forgetting=forgetting,
     )
@@ -208,7 +212,8 @@ def identify(
     remark = "" if equations is None else unit_remark(equations, measured.columns, measured.time_min)
     with task(f"identifying {file.name}"), unfit_lines([file], as_json=as_json), prefix_errors(file):
         if compare:
-            text = identification.compare(measured, described.inputs, outputs, form, as_json=as_json)
+            delays = identification.read_delay(delay or "auto")
+            text = identification.compare(measured, described.inputs, outputs, order, delays, as_json=as_json)
         else:
             text = identification.fit(measured, described.inputs, outputs, form, held_out, settle, as_json=as_json)
     print_report(text, as_json=as_json)

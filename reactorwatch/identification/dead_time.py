@@ -7,6 +7,9 @@ with feedback, or with inputs that move together, the correlation of one input w
 each, since a short model of inputs with different poles makes up for its error by a wrong dead time.
 """
 
+from collections.abc import Sequence
+from typing import TypeAlias
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,8 +23,12 @@ LONGEST = 25  # rows; the studied dead times end at 20, with 5 to spare
 OUTPUT_LAGS = 15
 
 
-def resolve_delay(delay: int | str | dict[str, int], data: Dataset) -> Delay:
-    """Delay of a structure as it was asked for: a number, `auto`, or one by the name of each input.
+DelayChoice: TypeAlias = int | str | dict[str, int]
+"""Delay as it is asked for: a number of samples, `auto`, or one by the name of each input."""
+
+
+def resolve_delay(delay: DelayChoice, data: Dataset) -> Delay:
+    """Delay of a structure.
 
     Raises:
         InputError: an input that the record does not have or that has no delay, or a record that is too short.
@@ -35,6 +42,11 @@ def resolve_delay(delay: int | str | dict[str, int], data: Dataset) -> Delay:
     if delay != "auto":
         raise InputError(f"delay must be a number of samples, auto, or one by input as u1=3,u2=15, got {delay!r}")
     return find_dead_times(data) if data.input_names else 1
+
+
+def name_delays(delay: Delay, inputs: Sequence[str]) -> int | dict[str, int]:
+    """Delay of a structure in an answer: by the name of each input where they differ."""
+    return delay if isinstance(delay, int) else dict(zip(inputs, delay, strict=True))
 
 
 def find_dead_times(data: Dataset) -> tuple[int, ...]:
