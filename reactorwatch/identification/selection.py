@@ -61,22 +61,22 @@ class Candidate(msgspec.Struct, frozen=True):
     Attributes:
         family: name of the family.
         order: lags of output and input.
-        delay: delay of the inputs in samples, or of each.
         parameters: number of parameters.
         one_step_percent: fit of the one-step prediction on the held-out half.
         free_run_percent: fit of the simulation on the held-out half; -inf if it diverged.
         bic: BIC on the fitted half; comparable within a family.
         refusal: reason why there is no such model; empty if there is one.
+        delay: delay of the inputs in samples, or of each.
     """
 
     family: str
     order: int
-    delay: Delay = 1
     parameters: int = 0
     one_step_percent: float = math.nan
     free_run_percent: float = math.nan
     bic: float = math.nan
     refusal: str = ""
+    delay: Delay = 1
 
 
 @dataclass(frozen=True)
@@ -156,17 +156,17 @@ def select(
         try:
             model = fit(structure, u[:half], y[:half], t[:half])
         except InputError as refusal:
-            candidates.append(Candidate(family, order, structure.delay, refusal=str(refusal)))
+            candidates.append(Candidate(family, order, refusal=str(refusal), delay=structure.delay))
             continue
         held_out = u[half:], y[half:], t[half:]
         candidate = Candidate(
             family,
             order,
-            structure.delay,
             model.parameter_count,
             fit_percent(y[half:, 0], model.predict(*held_out)[:, 0]),
             free_run_percent(model, y[half:, 0], model.simulate(*held_out)[:, 0]),
             bic(model.residuals(u[:half], y[:half], t[:half]), model.parameter_count),
+            delay=structure.delay,
         )
         candidates.append(candidate)
         fitted.append((candidate, model))
