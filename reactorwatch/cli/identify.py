@@ -100,13 +100,13 @@ def read_delay(text: str) -> DelayChoice:
 
 
 def _selection_json(selection: Selection, data: Dataset) -> str:
-    def named(candidate: Candidate) -> dict[str, Any]:
+    def as_item(candidate: Candidate) -> dict[str, Any]:
         return msgspec.structs.asdict(candidate) | {"delay": name_delays(candidate.delay, data.input_names)}
 
-    chosen = named(selection.chosen)
+    chosen = as_item(selection.chosen)
     report = {
         "output": data.output_name,
-        "candidates": [named(candidate) for candidate in selection.candidates],
+        "candidates": [as_item(candidate) for candidate in selection.candidates],
         "chosen": {name: chosen[name] for name in ("family", "order", "delay")} if selection.fits else None,
         "reason": selection.reason,
     }
