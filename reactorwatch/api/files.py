@@ -35,12 +35,13 @@ def record(
         plant: plant in a recording.
         columns: names of a table's columns, by signal.
         process: process whose signals are read; None: the reactor.
-        stated: statements about the form of a table, beside those of the process.
+        stated: statements about the form of a table, beside those of the process; the rows of a recording may be
+            resampled too.
 
     Raises:
         InputError: the file is neither a table nor an .mcap, or is malformed.
     """
-    from reactorwatch.description.read import convert_to_process, find_process, read_process_table
+    from reactorwatch.description.read import convert_to_process, find_process, read_process_table, resample_rows
 
     described = process or find_process()
     if file_kind(path) == "mcap":
@@ -48,7 +49,8 @@ def record(
 
         check_workbook(path, stated.sheet)
         recorded = read_record(path, plant, described)
-        return recorded if process is None else convert_to_process(recorded, process)
+        converted = recorded if process is None else convert_to_process(recorded, process)
+        return resample_rows(converted, described, stated)
     return read_process_table(path, described, columns, stated)
 
 

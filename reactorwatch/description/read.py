@@ -28,6 +28,7 @@ from reactorwatch.records.decode import check_workbook, read_regular, wrap_read_
 from reactorwatch.records.file_format import GUESS, FileFormat
 from reactorwatch.records.read import MissingColumnError, SignalColumn, read_table
 from reactorwatch.records.record import LARGEST_VALUE, Record
+from reactorwatch.records.resampling import resample
 from reactorwatch.records.times import STANDARD
 from reactorwatch.units import conversion
 
@@ -323,7 +324,17 @@ def read_process_table(
         if process.model is None:
             cure += ", or its columns with --input and --output"
         raise InputError(f"{error}; if it is no record of the reactor, {cure}") from error
-    return _to_model_units(_exclude_impossible(measured, process), process)
+    return resample_rows(_to_model_units(_exclude_impossible(measured, process), process), process, stated)
+
+
+def resample_rows(record: Record, process: Process, stated: FileFormat) -> Record:
+    """Resample the rows of a process's record, if that is stated.
+
+    Raises:
+        InputError: as `resample`.
+    """
+    rule = stated.resample_rule
+    return record if rule is None else resample(record, rule, {item.name: item.role for item in process.signals})
 
 
 def read_signals(
