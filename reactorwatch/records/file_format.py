@@ -26,7 +26,7 @@ and after it, or the values near the row and none in the other rows."""
 
 
 class ResampleRule(NamedTuple):
-    """How rows are resampled.
+    """Period and methods by which rows are resampled.
 
     Attributes:
         period_s: the period in seconds; None: that of the fastest signal.

@@ -1,6 +1,13 @@
-"""Resample a record to rows of one period: means of fast signals, held values of those reported by exception. Pure."""
+"""Resample a record to rows of one period: means of fast signals, held values of those reported by exception. Pure.
 
-from collections.abc import Mapping
+Row k of a run stands for the time t_k = t_0 + k P, and its input is held until t_(k+1). So the mean of an output is
+over the time around its row, from t_k - P/2 to t_k + P/2, and that of an input from t_k to t_(k+1). Both are integrals
+over time: a value of an output stands for half of the way to its neighbours, one of an input until the next one. A ramp
+so stays the ramp that it was, many values in a short time weigh no more than one, regular rows of this period stay as
+they are, and a signal that is slower than the rows keeps its nearest value (an input, its last one) between.
+"""
+
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from typing import NamedTuple
@@ -21,6 +28,10 @@ _SLOW = 1.5
 """A signal is slower than the period if its median spacing is this many periods: halfway from one to every second
 row."""
 
+_LEAST_COVERED = 0.75
+"""Share of a period that values must stand for, if it is to have a mean: the middle of what is left is off by an eighth
+of a period at most. More than half of it must be measurements."""
+
 _MOST_ROWS = 50_000_000
 """Rows of a resampled record: 400 MB a signal. More are asked for by a period in the wrong unit."""
 
@@ -31,6 +42,9 @@ _SMALL_MOVES = 0.05
 """Share of moves below half of the median move up to which a signal is reported by exception. A deadband leaves none,
 and normal noise has 26 %: P(|z| < 0.674 / 2)."""
 
+_DIGITS = 6
+"""Decimals of times in periods: stamps are rounded to a digit, and one that is a row's is to be exactly the row's."""
+
 
 class _Series(NamedTuple):
     """Values of one signal in one run, each of shape (values,); excluded ones are no measurements."""
@@ -40,20 +54,26 @@ class _Series(NamedTuple):
     excluded: NDArray[np.bool_]
 
 
-class _Grid(NamedTuple):
-    """Rows of a run: row k is at `start_min + k * period_min`; `rows` are those outside gaps, in order."""
+class _Plan(NamedTuple):
+    """Resampling of one signal.
 
-    start_min: float
-    period_min: float
-    rows: NDArray[np.int64]
+    Attributes:
+        method: one of the methods.
+        is_input: True if a value acts until the next one.
+        is_slow: True if it has fewer values than there are rows.
+        spacing: median spacing of its values, in periods.
+        longest: longest time for which a value stands, in periods; infinite for a signal that is silent until it moves.
+    """
+
+    method: str
+    is_input: bool
+    is_slow: bool
+    spacing: float
+    longest: float
 
 
 def resample(record: Record, rule: ResampleRule, roles: Mapping[str, str]) -> Record:
-    """Resample a record to rows of one period, each run by itself.
-
-    The rows of a run are whole periods after its first row. A mean is over the period around its row; that of an input
-    with several values in a period is over the period that begins there, for which a model holds it. A held value is
-    the last one up to its row.
+    """Resample a record to rows of one period, each run by itself from its first row.
 
     Args:
         record: the record; NaN: not measured.
@@ -61,7 +81,7 @@ def resample(record: Record, rule: ResampleRule, roles: Mapping[str, str]) -> Re
         roles: role by signal; a signal without one is an output.
 
     Returns:
-        The record; `read_as` states period, methods, held rows and gaps.
+        The record; `read_as` states period, methods and gaps. Rows in gaps, and those without any value, are left out.
 
     Raises:
         InputError: the rule names a signal that is not there, no signal has two values, or the period is too short.
@@ -70,44 +90,36 @@ def resample(record: Record, rule: ResampleRule, roles: Mapping[str, str]) -> Re
         if name not in record.columns:
             raise InputError(f"{record.name}: --resample: {describe_unknown('signal', name, record.columns)}")
     runs = [(run, {name: _series(run, name) for name in record.columns}) for run in record.split_runs()]
-    spacings = {name: np.concatenate([np.diff(series[name].time_min) for _, series in runs]) for name in record.columns}
-    by_exception = {
-        name: is_by_exception([(series[name].time_min, series[name].values) for _, series in runs])
-        for name in record.columns
-    }
-    period_min = find_period_min(record.name, spacings, by_exception) if rule.period_s is None else rule.period_s / 60.0
-    slow = {name: not values.size or np.median(values) > _SLOW * period_min for name, values in spacings.items()}
-    methods = {
-        name: rule.methods.get(name)
-        or rule.method
-        or _choose_method(roles.get(name, "output"), is_slow=slow[name], by_exception=by_exception[name])
-        for name in record.columns
-    }
-    stamps = [np.unique(np.concatenate([item.time_min for item in series.values()])) for _, series in runs]
-    gap_min = _longest_hold(np.concatenate([np.diff(item) for item in stamps]), period_min)
-    resampled, held, gaps = [], 0, 0
-    for (run, series), times in zip(runs, stamps, strict=True):
-        if not times.size:
-            continue
-        grid, found = _make_grid(record.name, times, period_min, gap_min)
-        gaps += found
-        columns, excluded = {}, {}
-        for name, own in series.items():
-            is_fast = spacings[name].size and np.median(spacings[name]) <= period_min / 2
-            lead = 0.5 if roles.get(name) == "input" and is_fast else 0.0
-            longest_min = gap_min if by_exception[name] or slow[name] else _longest_hold(spacings[name], period_min)
-            values, bad, own_held = _resample(own, grid, methods[name], longest_min, lead)
-            columns[name] = np.where(bad, np.nan, values)
-            if name in record.excluded:
-                excluded[name] = np.where(bad, values, np.nan)
-            held += own_held if methods[name] == MEAN else 0
-        time_min = grid.start_min + grid.rows * period_min
-        resampled.append(
-            replace(run, time_min=time_min, columns=columns, excluded=excluded, first_row=None),
+    series = {name: [own[name] for _, own in runs] for name in record.columns}
+    spacings = {name: np.concatenate([np.diff(own.time_min) for own in parts]) for name, parts in series.items()}
+    by_exception = {name for name, parts in series.items() if is_by_exception([part[:2] for part in parts])}
+    period_min, reason = (
+        (rule.period_s / 60.0, "")
+        if rule.period_s is not None
+        else find_period_min(record.name, spacings, by_exception)
+    )
+    has_faster = any(values.size and np.median(values) <= _SLOW * period_min for values in spacings.values())
+    plans = {
+        name: _plan(
+            rule,
+            name,
+            roles.get(name, "output"),
+            values / period_min,
+            by_exception=name in by_exception,
+            has_faster=has_faster,
         )
-    joined = join_runs(resampled)
-    read_as = ", ".join(filter(None, [record.read_as, _describe(period_min, methods, held, gaps)]))
-    return replace(joined, read_as=read_as)
+        for name, values in spacings.items()
+    }
+    stamps = [np.unique(np.concatenate([item.time_min for item in own.values()])) for _, own in runs]
+    gap = _longest(np.concatenate([np.diff(times) for times in stamps]) / period_min)
+    resampled, gaps = [], 0
+    for (run, own), times in zip(runs, stamps, strict=True):
+        if times.size:
+            rows, found = _find_rows(record.name, times, period_min, gap)
+            resampled.append(_resample_run(run, own, plans, float(times[0]), period_min, rows))
+            gaps += found
+    read_as = ", ".join(filter(None, [record.read_as, _state(period_min, reason, plans, gaps)]))
+    return replace(join_runs(resampled), read_as=read_as)
 
 
 def _series(run: Record, name: str) -> _Series:
@@ -116,7 +128,7 @@ def _series(run: Record, name: str) -> _Series:
     return _Series(run.time_min[known], values[known], np.isnan(run.columns[name][known]))
 
 
-def is_by_exception(runs: list[tuple[Array, Array]]) -> bool:
+def is_by_exception(runs: Sequence[tuple[Array, Array]]) -> bool:
     """True if a signal is reported when it has moved: at irregular times, and by no small moves.
 
     Values that came because the longest time between two reports had passed do not count.
@@ -126,34 +138,38 @@ def is_by_exception(runs: list[tuple[Array, Array]]) -> bool:
     """
     spacing = np.concatenate([np.diff(times) for times, _ in runs])
     moves = np.abs(np.concatenate([np.diff(values) for _, values in runs]))
-    if spacing.size < _LEAST_MOVES:
-        return False
-    if np.mean(np.abs(spacing - np.median(spacing)) < 0.2 * np.median(spacing)) > 0.9:
+    if spacing.size < _LEAST_MOVES or _is_regular(spacing):
         return False
     own = moves[spacing < 0.95 * np.quantile(spacing, 0.99)]
     return own.size >= _LEAST_MOVES and float(np.mean(own < 0.5 * np.median(own))) <= _SMALL_MOVES
 
 
-def find_period_min(name: str, spacings: Mapping[str, Array], by_exception: Mapping[str, bool]) -> float:
+def _is_regular(spacing: Array) -> bool:
+    """True if nine in ten spacings are the median one to a fifth: a sampler's, perhaps with lost values."""
+    return spacing.size > 0 and float(np.mean(np.abs(spacing / np.median(spacing) - 1) < 0.2)) > 0.9
+
+
+def find_period_min(name: str, spacings: Mapping[str, Array], by_exception: set[str]) -> tuple[float, str]:
     """Median spacing of the fastest signal that is sampled, or of all signals if all are reported by exception.
 
     Args:
         name: name of the record, for the error.
         spacings: minutes between a signal's values, by signal.
-        by_exception: True for a signal that is reported by exception, by signal.
+        by_exception: signals that are reported by exception.
 
     Returns:
-        Minutes, to three digits of their unit.
+        Minutes, to three digits of their unit; and the reason, for people.
 
     Raises:
         InputError: no signal has two values.
     """
     medians = {signal: float(np.median(values)) for signal, values in spacings.items() if values.size}
-    sampled = [value for signal, value in medians.items() if not by_exception[signal]]
     if not medians:
         raise InputError(f"{name}: --resample auto: expected a signal with two values, got none; state a period")
-    amount, unit = _in_unit(min(sampled or medians.values()))
-    return float(f"{amount:.3g}") * SECONDS[unit] / 60.0
+    sampled = {signal: value for signal, value in medians.items() if signal not in by_exception} or medians
+    fastest = min(sampled, key=sampled.__getitem__)
+    amount, unit = _in_unit(sampled[fastest])
+    return float(f"{amount:.3g}") * SECONDS[unit] / 60.0, f" (median spacing of {fastest})"
 
 
 def _in_unit(minutes: float) -> tuple[float, str]:
@@ -163,98 +179,131 @@ def _in_unit(minutes: float) -> tuple[float, str]:
     return seconds / SECONDS[unit], unit
 
 
-def _choose_method(role: str, *, is_slow: bool, by_exception: bool) -> str:
-    """Method of a signal: the mean of a fast one, the last value of what is held, else each value in its row."""
-    if role in ("mode", "label"):
-        return LAST
-    if not is_slow:
-        return LAST if by_exception else MEAN
-    return LAST if by_exception or role in ("input", "setpoint") else SPARSE
+def _plan(rule: ResampleRule, name: str, role: str, spacing: Array, *, by_exception: bool, has_faster: bool) -> _Plan:
+    """Resampling of a signal from its role and its spacings in periods; `has_faster`: another signal is not slow."""
+    median = float(np.median(spacing)) if spacing.size else np.inf
+    is_slow, is_code = median > _SLOW, role in ("mode", "label")
+    is_sparse = is_slow and has_faster and role == "output"
+    of_kind = LAST if by_exception or role == "setpoint" else SPARSE if is_sparse else MEAN
+    method = rule.methods.get(name) or (LAST if is_code else rule.method) or of_kind
+    lasts = by_exception or (role != "output" and not _is_regular(spacing))
+    longest = np.inf if lasts else _longest(spacing)
+    return _Plan(method, role != "output", is_slow, median if spacing.size else 1.0, longest)
 
 
-def _longest_hold(spacing: Array, period_min: float) -> float:
-    usual = float(np.quantile(spacing, 0.9)) if spacing.size else 0.0
-    return LONGEST_HOLD * max(period_min, usual)
+def _longest(spacing: Array) -> float:
+    return LONGEST_HOLD * max(1.0, float(np.quantile(spacing, 0.9)) if spacing.size else 0.0)
 
 
-def _make_grid(name: str, times: Array, period_min: float, gap_min: float) -> tuple[_Grid, int]:
-    """Rows of a run from its times, and the number of gaps."""
+def _find_rows(name: str, times: Array, period_min: float, gap: float) -> tuple[NDArray[np.int64], int]:
+    """Numbers of the rows of a run that are in no gap, in order, and the number of gaps."""
     index = (times - times[0]) / period_min
-    ends = np.flatnonzero(np.diff(times) > gap_min)
+    ends = np.flatnonzero(np.diff(index) > gap)
     edges = [0, *(int(end) + 1 for end in ends), times.size]
-    spans = [(_nearest(index[first]), _nearest(index[end - 1])) for first, end in pairwise(edges)]
-    if sum(int(last - first) + 1 for first, last in spans) > _MOST_ROWS:
+    nearest = np.floor(np.round(index, _DIGITS) + 0.5)
+    spans = [(float(nearest[first]), float(nearest[end - 1])) for first, end in pairwise(edges)]
+    if sum(last - first + 1 for first, last in spans) > _MOST_ROWS:
         amount, unit = _in_unit(period_min)
-        raise InputError(
-            f"{name}: --resample {amount:g} {unit} makes more than {_MOST_ROWS:,} rows; state a longer one"
-        )
-    rows = np.unique(np.concatenate([np.arange(first, last + 1) for first, last in spans]))
-    return _Grid(float(times[0]), period_min, rows), int(ends.size)
+        cure = "state a longer one"
+        raise InputError(f"{name}: --resample {amount:g} {unit} makes more than {_MOST_ROWS:,} rows; {cure}")
+    rows = [np.arange(int(first), int(last) + 1, dtype=np.int64) for first, last in spans]
+    return np.unique(np.concatenate(rows)), int(ends.size)
 
 
-_ROUNDING = 1e-6
-"""Share of a period within which a time counts as that of a row: stamps are rounded to a digit."""
+def _resample_run(
+    run: Record,
+    series: Mapping[str, _Series],
+    plans: Mapping[str, _Plan],
+    start_min: float,
+    period_min: float,
+    rows: NDArray[np.int64],
+) -> Record:
+    """Rows of one run, without those in which nothing is measured."""
+    measured, excluded = dict[str, Array](), dict[str, Array]()
+    for name, (times, values, is_excluded) in series.items():
+        index, plan = np.round((times - start_min) / period_min, _DIGITS), plans[name]
+        make = _METHODS[plan.method]
+        measured[name] = make(index, np.where(is_excluded, np.nan, values), rows, plan)
+        if name in run.excluded:
+            excluded[name] = make(index, np.where(is_excluded, values, np.nan), rows, plan)
+    stay = ~np.all(np.isnan([*measured.values(), *excluded.values()]), axis=0)
+    return replace(
+        run,
+        time_min=start_min + rows[stay] * period_min,
+        columns={name: values[stay] for name, values in measured.items()},
+        excluded={name: values[stay] for name, values in excluded.items()},
+        first_row=None,
+    )
 
 
-def _nearest(index: Array) -> NDArray[np.int64]:
-    return np.floor(index + 0.5 + _ROUNDING).astype(np.int64)
+def _mean(index: Array, values: Array, rows: NDArray[np.int64], plan: _Plan) -> Array:
+    """Mean over the time of each row; see the text of this module."""
+    if not index.size:
+        return np.full(rows.size, np.nan)
+    end = max(1.0, plan.spacing) if plan.is_input else plan.spacing  # what a value before a gap stands for
+    steps = np.diff(index)
+    ahead = np.append(np.where(steps > plan.longest, end, steps), end if plan.longest < np.inf else np.inf)
+    if plan.is_input:
+        offset, starts, ends = 0.0, index, index + ahead
+    else:
+        offset, starts, ends = 0.5, index - np.append(end, ahead[:-1]) / 2, index + ahead / 2
+    ends = np.minimum(ends, rows[-1] + 1.0)
+    cuts = np.unique(np.concatenate([starts, ends, rows - offset, rows + (1 - offset)]))
+    middle, length = (cuts[1:] + cuts[:-1]) / 2, np.diff(cuts)
+    value = np.searchsorted(starts, middle, side="right") - 1
+    row = np.minimum(np.searchsorted(rows, np.floor(middle + offset)), rows.size - 1)
+    stands = (value >= 0) & (middle < ends[value]) & (rows[row] == np.floor(middle + offset))
+    row, length, value = row[stands], length[stands], values[value[stands]]
+    is_known = ~np.isnan(value)
+    covered = np.bincount(row, length, rows.size)
+    known = np.bincount(row[is_known], length[is_known], rows.size)
+    sums = np.bincount(row[is_known], (length * value)[is_known], rows.size)
+    has_mean = (covered >= _LEAST_COVERED) & (known > covered / 2)
+    return np.where(has_mean, sums / np.where(has_mean, known, 1.0), np.nan)
 
 
-def _resample(
-    own: _Series, grid: _Grid, method: str, longest_min: float, lead: float
-) -> tuple[Array, NDArray[np.bool_], int]:
-    """Values of a signal in the rows, True where a value is excluded, and the number of rows with a held value.
-
-    Args:
-        own: the signal.
-        grid: the rows.
-        method: one of the methods.
-        longest_min: time for which a value is held, in minutes.
-        lead: share of a period by which the interval of a mean is moved on.
-    """
-    values, bad = np.full(grid.rows.size, np.nan), np.zeros(grid.rows.size, dtype=bool)
-    if not own.values.size:
-        return values, bad, 0
-    index = (own.time_min - grid.start_min) / grid.period_min
-    if method == INTERPOLATED:
-        good = ~own.excluded
-        if not good.any():
-            return values, bad, 0
-        at = np.searchsorted(index[good], grid.rows - _ROUNDING)
-        padded = np.concatenate([[-np.inf], index[good], [np.inf]])
-        near = (padded[at + 1] - padded[at]) * grid.period_min <= longest_min
-        near |= np.abs(padded[at + 1] - grid.rows) <= _ROUNDING
-        return np.where(near, np.interp(grid.rows, index[good], own.values[good]), np.nan), bad, 0
-    cell = np.ceil(index - _ROUNDING).astype(np.int64) if method == LAST else _nearest(index - lead)
-    order = np.argsort(cell, kind="stable")  # times increase, so this keeps the last value of a row last
-    cell, known, excluded = cell[order], own.values[order], own.excluded[order]
-    at = np.searchsorted(cell, grid.rows, side="right") - 1
-    age = np.where(at >= 0, grid.rows - cell[at], np.iinfo(np.int64).max)
-    shown = age == 0 if method == SPARSE else age * grid.period_min <= longest_min
-    values[shown], bad[shown] = known[at[shown]], excluded[at[shown]]
-    if method != LAST:
-        first = cell[0]
-        counts = np.bincount(cell - first, ~excluded)
-        sums = np.bincount(cell - first, np.where(excluded, 0.0, known))
-        with np.errstate(invalid="ignore", divide="ignore"):
-            means = sums / counts
-        fresh = (age == 0) & (counts[np.minimum(np.maximum(grid.rows - first, 0), counts.size - 1)] > 0)
-        values[fresh], bad[fresh] = means[grid.rows[fresh] - first], False
-    return values, bad, int(np.count_nonzero(shown & (age > 0)))
+def _last(index: Array, values: Array, rows: NDArray[np.int64], plan: _Plan) -> Array:
+    """Last value up to each row."""
+    at = np.searchsorted(index, rows, side="right") - 1
+    age = rows - np.concatenate([index, [-np.inf]])[at]
+    return np.where(age <= plan.longest, np.concatenate([values, [np.nan]])[at], np.nan)
 
 
-def _describe(period_min: float, methods: Mapping[str, str], held: int, gaps: int) -> str:
-    """What was done, for people; of many signals of one method their number."""
+def _sparse(index: Array, values: Array, rows: NDArray[np.int64], _plan: _Plan) -> Array:
+    """Each value in its nearest row, the last one where there are several."""
+    at = np.searchsorted(index, rows + 0.5, side="left") - 1
+    age = rows - np.concatenate([index, [-np.inf]])[at]
+    return np.where(age <= 0.5, np.concatenate([values, [np.nan]])[at], np.nan)
+
+
+def _interpolate(index: Array, values: Array, rows: NDArray[np.int64], plan: _Plan) -> Array:
+    """The line between the values before and after each row."""
+    if not index.size:
+        return np.full(rows.size, np.nan)
+    before = np.concatenate([[-np.inf], index])[np.searchsorted(index, rows, side="right")]
+    after = np.append(index, np.inf)[np.searchsorted(index, rows, side="left")]
+    return np.where(after - before <= plan.longest, np.interp(rows, index, values), np.nan)
+
+
+_METHODS = {MEAN: _mean, LAST: _last, SPARSE: _sparse, INTERPOLATED: _interpolate}
+
+
+def _state(period_min: float, reason: str, plans: Mapping[str, _Plan], gaps: int) -> str:
+    """Statement for people: period, methods and gaps; of many signals of one method their number."""
     amount, unit = _in_unit(period_min)
-    by_method = {
-        kind: [name for name, own in methods.items() if own == kind] for kind in dict.fromkeys(methods.values())
-    }
-    shown = 4  # names of a method that a line of a terminal has room for
+    groups: dict[str, list[str]] = {}
+    for name, plan in plans.items():
+        between = {
+            MEAN: "held between" if plan.is_input else "the nearest value between",
+            LAST: "held between",
+            SPARSE: "empty between",
+        }
+        has_note = plan.is_slow and plan.method in between
+        groups.setdefault(plan.method + (f" ({between[plan.method]})" if has_note else ""), []).append(name)
     parts = [
         part
-        for kind, names in by_method.items()
-        for part in ([f"{name} {kind}" for name in names] if len(names) <= shown else [f"{len(names)} signals {kind}"])
+        for kind, names in groups.items()
+        for part in ([f"{name} {kind}" for name in names] if len(names) <= 4 else [f"{len(names)} signals {kind}"])
     ]
-    counts = [f"{held} means without a value held from the row before"] if held else []
-    counts += [f"{gaps} gap{'' if gaps == 1 else 's'} left"] if gaps else []
-    return ", ".join([f"resampled to {amount:.6g} {unit}: {', '.join(parts)}", *counts])
+    left = [f"{gaps} gap{'' if gaps == 1 else 's'} left"] if gaps else []
+    return ", ".join([f"resampled to {amount:.6g} {unit}{reason}: {', '.join(parts)}", *left])
