@@ -104,7 +104,8 @@ def test_files_in_a_row_are_joined_before_they_are_resampled(export: Path, tmp_p
 def test_the_description_of_a_process_states_how_its_files_are_resampled(export: Path, tmp_path: Path) -> None:
     described = tmp_path / "rig.toml"
     described.write_text(
-        'name = "rig"\nsignals = [{name = "u", role = "input"}, {name = "y", role = "output"}]\n[file]\nresample = "10 s,y=last"\n'
+        'name = "rig"\nsignals = [{name = "u", role = "input"}, {name = "y", role = "output"}]\n'
+        '[file]\nresample = "10 s,y=last"\n'
     )
     assert "u mean (held between), y last" in rw.read_record(export, process=str(described)).read_as
     assert "resampled to 20 s" in rw.read_record(export, process=str(described), resample="20 s").read_as
