@@ -10,6 +10,7 @@ import reactorwatch as rw
 from reactorwatch.api.files import record_of_process
 from reactorwatch.description.read import ProcessChoice
 from reactorwatch.records.file_format import FileFormat
+from reactorwatch.records.record import Record
 from recorder.tools.convert import export_csv, import_csv
 from tests.running import Command
 
@@ -44,7 +45,7 @@ def export(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def read(path: Path, resample: str | None = "10 s") -> rw.Record:
+def read(path: Path, resample: str | None = "10 s") -> Record:
     return record_of_process(path, None, {}, CHOICE, FileFormat(resample=resample))[0]
 
 

@@ -23,11 +23,11 @@ def make_rows(record: Record, rule: str, **roles: str) -> Record:
 
 def table(**signals: tuple[Array, Array]) -> Record:
     """A record of signals with times of their own, in seconds."""
-    times = np.unique(np.concatenate([own for own, _ in signals.values()]))
+    times: Array = np.unique(np.concatenate([own for own, _ in signals.values()]))
     columns = {name: np.full(times.size, np.nan) for name in signals}
     for name, (own, values) in signals.items():
         columns[name][np.searchsorted(times, own)] = values
-    return Record(times * S, columns, "export")
+    return Record((times * S).astype(np.float64), columns, "export")
 
 
 def reports(values: Array, deadband: float) -> NDArray[np.intp]:
