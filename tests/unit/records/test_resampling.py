@@ -27,7 +27,7 @@ def table(**signals: tuple[Array, Array]) -> Record:
     columns = {name: np.full(times.size, np.nan) for name in signals}
     for name, (own, values) in signals.items():
         columns[name][np.searchsorted(times, own)] = values
-    return Record((times * S).astype(np.float64), columns, "export")
+    return Record(times * S, columns, "export")
 
 
 def reports(values: Array, deadband: float) -> NDArray[np.intp]:
@@ -46,7 +46,7 @@ def test_regular_rows_of_the_period_stay_as_they_are_to_the_last_bit(period: str
     columns = {name: rng.normal(350.0, 5.0, 500) for name in ("T", "u")}
     excluded = np.full(500, np.nan)
     columns["T"][[40, 41, 300]], excluded[[40, 41, 300]] = np.nan, -999.0
-    record = Record(7.3 + 0.1 * np.arange(500), columns, "export", excluded={"T": excluded})
+    record = Record(np.arange(500) / 10 + 7.3, columns, "export", excluded={"T": excluded})
     rows = make_rows(record, period + method, u="input")
     np.testing.assert_allclose(rows.time_min, record.time_min, rtol=0, atol=1e-12)
     for name, values in columns.items():
