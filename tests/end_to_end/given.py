@@ -57,14 +57,10 @@ def _later_record(path: Path) -> None:
 def _exported_record(path: Path) -> None:
     """The same as a historian exports it: T each 6 s, qc when it has moved, C from the laboratory each 5 min."""
     record = simulate_record(PlantConfig(seed=3, faults=(LEAK,)), 1500)
-    of_tag = {
-        "qc": np.flatnonzero(np.diff(record.columns["qc"], prepend=0.0)),
-        "T": range(1500),
-        "C": range(3, 1500, 50),
-    }
+    moved = np.flatnonzero(np.diff(record.columns["qc"], prepend=0.0))
     values = [
         (round(60 * record.time_min[row], 1), tag, record.columns[tag][row])
-        for tag, rows in of_tag.items()
+        for tag, rows in (("qc", moved.tolist()), ("T", range(1500)), ("C", range(3, 1500, 50)))
         for row in rows
     ]
     lines = ["time_s,tag,value", *(f"{time_s},{tag},{value:.6f}" for time_s, tag, value in sorted(values))]
