@@ -48,7 +48,7 @@ def info(
 ) -> None:
     """Show the contents of a recording, and missing messages; or how a table is read, and what is in it."""
     from reactorwatch.cli.info import info_object, info_text, table_object, table_text
-    from reactorwatch.description.read import read_signals
+    from reactorwatch.description.read import read_signals, resample_rows
     from reactorwatch.records.decode import check_workbook, is_table
     from reactorwatch.records.read import read_table
     from recorder.tools.inspect import inspect
@@ -58,11 +58,13 @@ def info(
         check_workbook(check_recording(file), table.sheet)
         if is_table(file) and not file.is_dir():
             record = (
-                read_table(file, None, table.file_format)
+                resample_rows(read_table(file, None, table.file_format), None, table.file_format)
                 if choice.is_default
                 else read_signals(file, choice, None, table.file_format)
             )
             text = json_line(table_object(record, file)) if as_json else table_text(record, file)
+        elif table.resample is not None:
+            raise InputError(f"--resample: info shows the recording {file} as it is; export it with --resample")
         else:
             seen = inspect(file)
             if not choice.is_default:
