@@ -1,28 +1,16 @@
-"""The level of each signal against that of the training: what moves more slowly than the noise, and lasts.
+"""The level of each output against that of the training: what moves more slowly than the noise, and lasts.
 
 A model that follows the plant also follows a slow fall, and its residuals show nothing. This chart compares with the
-training for good: it takes the exponentially weighted average of each measured value and is out as long as one of them
-is farther from its mean of the training than a slowly wandering signal comes by chance.
+training for good: it takes the exponentially weighted average of each output, less what the inputs explain of it, and
+is out as long as one of these levels is farther from the training than a slowly wandering signal comes by chance
+(`spc/slow_levels.py`). An output that follows its inputs to a new set point is not outside.
 
-The average of a wandering signal is itself a stationary process of standard deviation s and correlation r from row to
-row. It leaves +-L s as often as neighbours lie on two sides of a limit,
-
-    1 / ARL0 = 2 P(x <= L s, x' > L s) = 4 T(L, sqrt((1 - r) / (1 + r))),
-
-T being Owen's (1956, Tables for computing bivariate normal probabilities, Ann. Math. Statist. 27); for r near 1 it is
-the formula of Rice (1944, Mathematical analysis of random noise, Bell System Techn. J. 23). s and r are learned from
-the averages of the training. A training of n rows has n / (1 + 2 sum r_k) independent values for the mean, and n / (1 +
-2 sum r_k^2) for the variance (Bartlett 1946), with the correlations up to where they first vanish (initial positive
-sequence: Geyer 1992, Practical Markov chain Monte Carlo, Statist. Sci. 7), each raised for the mean that was
-subtracted. By both the limit is widened to Student's prediction interval: a training that is short against what the
-signal remembers says little, and the limit is wide.
-
-Where signals are several, the ratios of s^2 to the mean square of the average's steps, which is well known, moderate
-each other (`residual_space.moderate`).
+Limits grow where less is known of what the inputs explain: by sqrt(1 + h), h being the leverage of their averages; by
+c^2 where an input's average is c times as far off as ever in the training, as what a line neglects; and after a start
+by all that inputs before it may still do.
 """
 
 from collections.abc import Sequence
-from math import sqrt
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -30,48 +18,119 @@ from numpy.typing import ArrayLike
 from scipy import special
 
 from reactorwatch.arrays import Array
+from reactorwatch.codegen.numba_kernel import Entry, inline, jit
 from reactorwatch.errors import InputError, positive
-from reactorwatch.spc.charts.base import Judgement, Setting, vector
-from reactorwatch.spc.charts.residual_space import moderate
-from reactorwatch.spc.charts.value_chart import ValueBaseline, ValueChart, average_rows
-from reactorwatch.spc.false_alarm_budget import TrainingErrors, student_tail
-from reactorwatch.spc.run_length import limit_for
+from reactorwatch.spc.charts.base import LARGEST_VALUE, Judgement, Setting, vector
+from reactorwatch.spc.charts.value_chart import ValueBaseline, ValueChart
+from reactorwatch.spc.false_alarm_budget import TrainingErrors
+from reactorwatch.spc.slow_levels import FEWEST_SAMPLES, LAGS, InputResponse, SlowLevels, sample_spacing
 from reactorwatch.stored_state import Memory
+
+_INPUTS, _WEIGHT, _LIMIT, _BEFORE, _SLOWEST, _HEAD = range(6)
+
+
+class _Parts(NamedTuple):
+    """First number of each part of a chart's numbers, see `LevelMemory`."""
+
+    centres: int
+    averages: int
+    scales: int
+    doubts: int
+    gains: int
+    ranges: int
+    leverage: int
+    end: int
+
+
+@inline
+def _parts_of(inputs: int, outputs: int) -> _Parts:
+    explaining = inputs * LAGS
+    centres, averages = _HEAD, _HEAD + inputs + outputs
+    scales = averages + explaining + outputs
+    gains = scales + 2 * outputs
+    ranges = gains + outputs * explaining
+    leverage = ranges + inputs
+    return _Parts(
+        centres, averages, scales, scales + outputs, gains, ranges, leverage, leverage + explaining * explaining
+    )
+
+
+@jit
+def move(numbers: Array, x: Array) -> float:
+    """Take a row into the averages; returns the largest statistic, -1 if the row cannot be taken.
+
+    Args:
+        numbers: see `LevelMemory`.
+        x: inputs, then outputs, shape (k + p,).
+    """
+    k, weight = int(numbers[_INPUTS]), numbers[_WEIGHT]
+    p, explaining = x.size - k, k * LAGS
+    at = _parts_of(k, p)
+    for value in x:
+        if not abs(value) < LARGEST_VALUE:
+            return -1.0
+    wide, leverage = 1.0, 1.0
+    for j in range(k):
+        first, part = at.averages + j * LAGS, weight
+        numbers[first] += weight * (x[j] - numbers[at.centres + j] - numbers[first])
+        for i in range(first + 1, first + LAGS):
+            numbers[i] += part * (numbers[first] - numbers[i])
+            part *= 0.25
+        distance = numbers[first] / numbers[at.ranges + j]
+        wide = max(wide, distance * distance)
+    numbers[_BEFORE] *= 1.0 - numbers[_SLOWEST]
+    for i in range(explaining):
+        for j in range(explaining):
+            leverage += numbers[at.leverage + i * explaining + j] * numbers[at.averages + i] * numbers[at.averages + j]
+    wide *= np.sqrt(leverage)
+    largest, outputs = 0.0, at.averages + explaining
+    for i in range(p):
+        numbers[outputs + i] += weight * (x[k + i] - numbers[at.centres + k + i] - numbers[outputs + i])
+        level = numbers[outputs + i]
+        for j in range(explaining):
+            level -= numbers[at.gains + i * explaining + j] * numbers[at.averages + j]
+        unit = wide * numbers[at.scales + i] + numbers[_BEFORE] * numbers[at.doubts + i]
+        largest = max(largest, abs(level) / unit)
+    return float(largest)
+
+
+_MOVE = Entry(move)
+
+
+def count_numbers(inputs: int, outputs: int) -> int:
+    """Number of numbers of a chart of so many signals, see `LevelMemory`."""
+    return int(_parts_of(inputs, outputs).end)
 
 
 class LevelMemory(Memory):
     """Memory of the chart.
 
     Attributes:
-        names: names of the signals.
-        weight: lambda.
-        limit: limit of the averages.
-        centres: mean of each signal in the training.
-        scales: one unit of the limit, in the units of each signal.
-        averages: deviation of each average from its mean.
+        names: names of the signals, the inputs first.
+        numbers: number of inputs, weight, limit, share of what was before the start in the slowest average that
+            explains an output, its weight; centres of the signals; averages, those of an input together; of each
+            output, one unit of the limit, and what inputs before the start may do, in units of the limit; then
+            coefficients, ranges and leverage as in `InputResponse`.
     """
 
     names: tuple[str, ...]
-    weight: float
-    limit: float
-    centres: Array
-    scales: Array
-    averages: Array
+    numbers: Array
 
 
 class Level(ValueChart):
-    """The average of each signal against its mean and slow variation in the training.
+    """The average of each output against its mean and slow variation in the training.
 
     >>> chart = Level(["T"], [80.0], [2.0], weight=0.5, limit=4.0)
     >>> [chart.update([x]).out for x in (76.0, 66.0, 66.0, 66.0)]
     [False, False, True, True]
 
     Args:
-        names: names of the signals.
-        centres: mean of each signal, shape (p,).
-        scales: standard deviation of each average, shape (p,).
+        names: names of the signals, the inputs first.
+        centres: mean of each signal, shape (k + p,).
+        scales: one unit of the limit of each output, shape (p,).
         weight: lambda, of the newest row, in (0, 1].
-        limit: limit of the averages, in these standard deviations.
+        limit: limit of the averages, in these units.
+        response: response to the inputs; None without inputs.
 
     Raises:
         InputError: an argument is out of its range, or the shapes differ.
@@ -80,150 +139,116 @@ class Level(ValueChart):
     name = "level"
     memory_type = LevelMemory
     fewest_signals = 1
+    is_of_outputs = True
     settings = (Setting("level_weight", 0.1, 0.001, 1.0),)
 
     def __init__(
-        self, names: Sequence[str], centres: ArrayLike, scales: ArrayLike, weight: float, limit: float
+        self,
+        names: Sequence[str],
+        centres: ArrayLike,
+        scales: ArrayLike,
+        weight: float,
+        limit: float,
+        response: InputResponse | None = None,
     ) -> None:
         if not 0.0 < weight <= 1.0:
             raise InputError(f"weight (lambda) must be in (0, 1], got {weight}")
-        middle, sds = np.array(centres, np.float64), np.array(scales, np.float64)
-        if not middle.shape == sds.shape == (len(names),) or not np.all(np.isfinite(middle)) or not np.all(sds > 0.0):
-            raise InputError(f"centres and scales must be {len(names)} finite numbers, scales positive, got {sds}")
-        memory = LevelMemory(tuple(names), weight, positive("limit", limit), middle, sds, np.zeros(len(names)))
-        self._use(memory)
+        middle, units = (np.array(item, np.float64) for item in (centres, scales))
+        p, k = units.size, len(names) - units.size
+        if middle.shape != (k + p,) or not np.all(np.isfinite(middle)) or not np.all(units > 0.0):
+            raise InputError(
+                f"there must be centres of {len(names)} signals and positive scales, got {middle}, {units}"
+            )
+        given = response or InputResponse(np.zeros((p, 0)), np.zeros(0), np.zeros((0, 0)), np.zeros(p), 1.0)
+        head = [k, weight, positive("limit", limit), 1.0 if k else 0.0, given.slowest]
+        parts = given.gains.ravel(), given.ranges, given.leverage.ravel()
+        averages = np.zeros(k * LAGS + p)
+        numbers = np.concatenate([head, middle, averages, units, given.before / limit, *parts])
+        self._use(LevelMemory(tuple(names), numbers))
 
     def _use(self, memory: LevelMemory) -> None:
         """See `Chart`."""
-        self.memory, self.names = memory, memory.names
-        for numbers in (memory.centres, memory.scales, memory.averages):
-            vector(numbers, len(self.names))
+        self.memory, self.names, numbers = memory, memory.names, memory.numbers
+        k = int(numbers[_INPUTS]) if numbers.size >= _HEAD else -1
+        p, explaining = len(self.names) - k, k * LAGS
+        if k < 0 or p < 1 or numbers.size != count_numbers(k, p) or not np.all(np.isfinite(numbers)):
+            raise ValueError(f"numbers of {len(self.names)} signals must be finite, got {numbers.tolist()}")
+        self._inputs, self.limit, at = k, float(numbers[_LIMIT]), _parts_of(k, p)
+        self._centres = numbers[at.centres : at.averages]
+        self._averages = numbers[at.averages : at.scales]
+        self._scales, self._doubts = numbers[at.scales : at.doubts], numbers[at.doubts : at.gains]
+        self._gains = numbers[at.gains : at.ranges].reshape(p, explaining)
+        self._ranges = numbers[at.ranges : at.leverage]
+        self._leverage = numbers[at.leverage :].reshape(explaining, explaining)
+
+    @classmethod
+    def obstacle(cls, baseline: ValueBaseline) -> str:
+        """See `ValueChart`."""
+        samples = 1 + FEWEST_SAMPLES + 2 * baseline.inputs
+        rows, needed = len(baseline.values), samples * sample_spacing(baseline.settings["level_weight"])
+        if len(baseline.names) == baseline.inputs:
+            return "no output varies in the training"
+        few = f"the training has {rows} rows with all signals, {needed} are needed for slow changes"
+        return few if rows < needed else ""
 
     @classmethod
     def design(cls, baseline: ValueBaseline) -> Self:
         """See `ValueChart`; `level_weight` is the weight of the newest row."""
-        weight = baseline.settings["level_weight"]
-        slow = SlowProcess.of(baseline.values, weight)
-        allowed, largest = slow.limits(baseline.arl0), float(np.max(slow.known_limits(baseline.arl0)))
-        return cls(baseline.names, slow.means, slow.sds * allowed / largest, weight, largest)
+        slow, weight = _slow_levels(baseline), baseline.settings["level_weight"]
+        limits = slow.limits(baseline.arl0)
+        limit = float(np.max(limits / slow.sds))
+        return cls(baseline.names, slow.centres, limits / limit, weight, limit, slow.response)
 
     @classmethod
     def relative_rates(cls, baseline: ValueBaseline) -> Array:
-        """See `ValueChart`: an average whose variance is off crosses the limit more or less often."""
-        slow = SlowProcess.of(baseline.values, baseline.settings["level_weight"])
-        known, errors = slow.known_limits(baseline.arl0), TrainingErrors.draw(len(baseline.names)).scale
-        limits = -special.stdtrit(slow.freedom, special.ndtr(-known))
-        tails = [student_tail(limit, slow.freedom, errors[:, i]) for i, limit in enumerate(limits.tolist())]
-        return np.asarray(np.sum([tail / special.ndtr(-L) for tail, L in zip(tails, known, strict=True)], axis=0))
+        """See `ValueChart`: for each draw of errors, the rate of the memory that it stands for."""
+        slow = _slow_levels(baseline)
+        rates = slow.rates(slow.limits(baseline.arl0)) * baseline.arl0
+        shares = special.ndtr(TrainingErrors.draw(slow.sds.size).scale)
+        return np.asarray(
+            sum(
+                rates[np.minimum(np.searchsorted(np.cumsum(slow.weights[:, i]), shares[:, i]), len(rates) - 1), i]
+                for i in range(slow.sds.size)
+            )
+        )
 
     def update(self, x: ArrayLike) -> Judgement:
-        """See `Chart`; x has shape (p,), NaN where a value is missing, whose average stays as it is."""
-        memory, values = self.memory, np.asarray(x, np.float64)
-        known = np.isfinite(values)
-        vector(np.where(np.isnan(values), 0.0, values), len(self.names))
-        off = np.where(known, values - memory.centres, memory.averages)
-        memory.averages += memory.weight * (off - memory.averages)
-        statistic = float(np.max(np.abs(memory.averages) / memory.scales))
-        return Judgement(statistic, 0.0, 0.0, memory.limit, statistic > memory.limit)
+        """See `Chart`; x has shape (k + p,)."""
+        values = np.ascontiguousarray(x, dtype=np.float64)
+        statistic = _MOVE.call(self.memory.numbers, values) if values.shape == self._centres.shape else -1.0
+        if statistic < 0.0:
+            vector(x, self._centres.size)  # says what is wrong
+        return Judgement(statistic, 0.0, 0.0, self.limit, statistic > self.limit)
 
     def fill(self, x: Array) -> Array | None:
-        """See `ValueChart`: a missing value stays missing."""
-        return x if np.isfinite(x).any() else None
+        """See `ValueChart`: the average of a missing signal stays as it is."""
+        known, explaining = np.isfinite(x), self._gains.shape[1]
+        newest = np.concatenate([self._averages[:explaining:LAGS], self._averages[explaining:]])
+        return np.where(known, x, self._centres + newest) if known.any() else None
 
     def explain(self) -> tuple[str, dict[str, float]]:
-        """See `ValueChart`: the signals outside their training, and shares of the squared deviations."""
-        memory = self.memory
-        sizes = memory.averages / memory.scales
+        """See `ValueChart`: the outputs outside their training, and shares of the squared deviations."""
+        k, (driving, own) = self._inputs, np.split(self._averages, [self._gains.shape[1]])
+        usual, levels = self._centres[k:] + self._gains @ driving, self._centres[k:] + own
+        beyond = max([1.0, *((driving[::LAGS] / self._ranges) ** 2)])
+        wide = beyond * np.sqrt(1.0 + driving @ self._leverage @ driving)
+        reach = self.limit * (wide * self._scales + self.memory.numbers[_BEFORE] * self._doubts)
+        sizes = (levels - usual) / reach
         order = np.argsort(-np.abs(sizes), kind="stable").tolist()
-        outside = [i for i in order if abs(sizes[i]) > memory.limit] or order[:1]
+        outside = [i for i in order if abs(sizes[i]) > 1.0] or order[:1]
         named = [
-            f"{self.names[i]} is on average {memory.centres[i] + memory.averages[i]:.4g} "
-            f"(allowed: {memory.centres[i] - memory.limit * memory.scales[i]:.4g} to "
-            f"{memory.centres[i] + memory.limit * memory.scales[i]:.4g})"
+            f"{self.names[k + i]} is on average {levels[i]:.4g} (allowed{' with these inputs' if k else ''}: "
+            f"{usual[i] - reach[i]:.4g} to {usual[i] + reach[i]:.4g})"
             for i in outside[:3]
         ]
         shares = sizes**2 / np.sum(sizes**2)
-        return f"outside its training: {' and '.join(named)}", {self.names[i]: float(shares[i]) for i in order}
+        return f"outside its training: {' and '.join(named)}", {self.names[k + i]: float(shares[i]) for i in order}
 
     def restart(self) -> None:
         """Forget the rows seen."""
-        self.memory.averages[:] = 0.0
+        self._averages[:] = 0.0
+        self.memory.numbers[_BEFORE] = 1.0 if self._inputs else 0.0
 
 
-class SlowProcess(NamedTuple):
-    """Averages of the signals in a training, as stationary processes.
-
-    Attributes:
-        means: mean of each signal.
-        sds: standard deviation of each average.
-        steps: ratio of the mean square of its steps to its variance, 2 (1 - r).
-        independent: number of independent values by which each mean is known.
-        freedom: degrees of freedom of the variances.
-    """
-
-    means: Array
-    sds: Array
-    steps: Array
-    independent: Array
-    freedom: float
-
-    @classmethod
-    def of(cls, values: Array, weight: float) -> Self:
-        """Learn them from a training, shape (rows, signals)."""
-        means = values.mean(axis=0)
-        averages = average_rows(values - means, weight)
-        squares, steps = averages.var(axis=0), np.mean(np.diff(averages, axis=0) ** 2, axis=0)
-        counts = np.array([independent_values(column) for column in averages.T])
-        independent, freedom = counts[:, 0], float(np.mean(counts[:, 1]))
-        # less the variance of the mean that was subtracted; of fewer than two independent values nothing is known
-        ratios = squares / (1.0 - 1.0 / np.maximum(independent, 2.0)) / steps
-        if ratios.size > 1:
-            ratios, freedom = moderate(ratios, freedom)
-        return cls(means, np.sqrt(ratios * steps), np.minimum(1.0 / ratios, 2.0), independent, freedom)
-
-    def known_limits(self, arl0: float) -> Array:
-        """Limit of each average whose variance is known, in standard deviations."""
-        return np.array([level_limit(arl0, step) for step in self.steps.tolist()])
-
-    def limits(self, arl0: float) -> Array:
-        """The same with the errors of the training."""
-        student = -special.stdtrit(self.freedom, special.ndtr(-self.known_limits(arl0)))
-        return np.asarray(student * np.sqrt(1.0 + 1.0 / self.independent))
-
-
-def level_run_length(limit: float, step: float) -> float:
-    """Mean number of rows between two crossings of +- a limit by a stationary normal process.
-
-    Args:
-        limit: limit in standard deviations.
-        step: mean square of the steps from row to row over the variance, in (0, 2]; 2 (1 - r).
-    """
-    crossing = 4.0 * float(special.owens_t(limit, sqrt(step / (4.0 - step))))
-    return 1.0 / max(crossing, 1e-300)
-
-
-def level_limit(arl0: float, step: float) -> float:
-    """Limit of such a process for a run length without a fault; at least half a standard deviation."""
-    if level_run_length(0.5, step) > arl0:  # it hardly moves, and leaves no limit so often
-        return 0.5
-    return limit_for(arl0, lambda limit: level_run_length(limit, step), 0.5, 10.0)
-
-
-def independent_values(average: Array) -> tuple[float, float]:
-    """Number of independent values by which the mean and the variance of a correlated signal are known.
-
-    Args:
-        average: shape (rows,).
-    """
-    rows = average.size
-    spectrum = np.fft.rfft(average - average.mean(), 2 * rows)
-    products = np.fft.irfft(np.abs(spectrum) ** 2)[: rows // 2]
-    correlations = products / products[0]
-    pairs = correlations[: correlations.size // 2 * 2].reshape(-1, 2).sum(axis=1)
-    ends = np.flatnonzero(pairs <= 0.05)  # below that they are hardly told from 0, and their sum would wander
-    correlations = correlations[: 2 * int(ends[0]) if ends.size else pairs.size * 2]
-    share = max(2.0 * float(correlations.sum()) - 1.0, 1.0) / rows
-    correlations = correlations + share * (1.0 - correlations)
-    of_mean = max(2.0 * float(correlations.sum()) - 1.0, 1.0)
-    of_variance = max(2.0 * float(np.sum(correlations**2)) - 1.0, 1.0)
-    return rows / of_mean, max(rows / of_variance, 3.0)  # Student's with fewer has no variance
+def _slow_levels(baseline: ValueBaseline) -> SlowLevels:
+    return SlowLevels.of(baseline.values, baseline.inputs, baseline.settings["level_weight"])
