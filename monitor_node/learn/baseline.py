@@ -371,7 +371,8 @@ def _prediction_obstacle(time_min: Array, inputs: Array) -> str:
     follows = regular_intervals(time_min)
     regular = np.count_nonzero(follows)
     if regular < 0.9 * follows.size:
-        return f"do rows come one by one period? {regular} of {follows.size} spacings are within a tenth of the usual"
+        found = f"{regular} of {follows.size} spacings are within a tenth of the usual"
+        return f"do rows come one by one period? {found}; --resample auto makes them regular"
     known = int(np.count_nonzero(np.isfinite(inputs).all(axis=1)))
     if FEWEST_ROWS <= known < 0.9 * len(inputs):
         return f"{'the input has a value' if inputs.shape[1] == 1 else 'all inputs have values'} in {known} of them"

@@ -35,7 +35,7 @@ from reactorwatch.description.read import ProcessChoice
 from reactorwatch.errors import prefix_errors
 from reactorwatch.process import DEFAULT_PROCESS
 from reactorwatch.process.model import ProcessModel
-from reactorwatch.records.decode import quote_formula
+from reactorwatch.records.decode import is_table, quote_formula
 from reactorwatch.records.record import to_minutes, to_time_ns
 from reactorwatch.records.write import atomic_write
 from reactorwatch.results.backtest import Backtest
@@ -125,7 +125,7 @@ def _open(file: Path, asked: BacktestOptions, *, learns: bool) -> _Opened:
     rows, messages = _count_rows(source.messages, plant)
     source = source._replace(messages=messages)
     if choice.is_default:
-        recorded = source.process if source.measured is None else None
+        recorded = None if is_table(file) else source.process
         if recorded is None:
             return _Opened(source, load_process(limit_training(settings, rows)), None, {})
         return _Opened(source, watch_process(settings, recorded, rows), recorded, {})
