@@ -382,7 +382,7 @@ def _prediction_obstacle(time_min: Array, inputs: Array) -> str:
     regular = np.count_nonzero(follows)
     if regular < 0.9 * follows.size:
         found = f"{regular} of {follows.size} spacings are within a tenth of the usual"
-        return f"do rows come one by one period? {found}; --resample auto makes them regular"
+        return f"do rows come one by one period? {found}; --resample auto, or resample in [monitor], makes them regular"
     known = int(np.count_nonzero(np.isfinite(inputs).all(axis=1)))
     if FEWEST_ROWS <= known < 0.9 * len(inputs):
         return f"{'the input has a value' if inputs.shape[1] == 1 else 'all inputs have values'} in {known} of them"
