@@ -296,7 +296,7 @@ def values_in_rows(index: Array, values: Array, rows: NDArray[np.int64], plan: S
         index: times of its values in periods after row 0, increasing, shape (values,).
         values: the values, shape (values,); NaN: no measurement.
         rows: numbers of the rows, increasing, shape (rows,).
-        plan: its resampling.
+        plan: resampling of the signal.
 
     Returns:
         Shape (rows,); NaN where it has none.

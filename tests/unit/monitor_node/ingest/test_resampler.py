@@ -76,7 +76,7 @@ def test_a_stored_memory_resumes_with_the_same_rows_bit_for_bit() -> None:
     assert same(expected, found)
 
 
-def test_a_gap_of_more_than_five_periods_stays_one_and_a_restart_begins_anew() -> None:
+def test_a_gap_of_more_than_five_periods_stays_one_and_a_restart_starts_a_run() -> None:
     rows = [Row(at * S, (1.0 if at == 0 else np.nan, float(at), np.nan), at == 0) for at in range(0, 100, 2)]
     later = [
         row._replace(time_ns=row.time_ns + 1000 * S, values=(np.nan, 5.0, np.nan), restarted=False) for row in rows
