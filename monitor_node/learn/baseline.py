@@ -357,11 +357,10 @@ def _predicts_as_well(candidate: _Candidate, identified: _Candidate) -> bool:
 
 def _too_few_values(names: tuple[str, ...], columns: Array, *, by_equations: bool = False) -> dict[str, str]:
     """Signals with too few values, with the reason."""
-    counts = np.count_nonzero(np.isfinite(columns), axis=0).tolist()
     return {
         name: f"only {count} of {len(columns)} rows have a value of it, {needed} are needed" if count else NO_VALUE
-        for name, count in zip(names, counts, strict=True)
-        if count < (needed := needed_values(count, len(columns), FEWEST_ROWS, by_equations=by_equations))
+        for name, count, needed in zip(names, *_counts(columns, by_equations=by_equations), strict=True)
+        if count < needed
     }
 
 
@@ -369,14 +368,24 @@ def _too_few_residuals(
     outputs: tuple[str, ...], z: Array, rows: RowArrays, left_out: dict[str, str], *, by_equations: bool
 ) -> dict[str, str]:
     """Outputs with values, but too few predictions, with the reason."""
-    counts = np.count_nonzero(np.isfinite(z), axis=0).tolist()
     return {
         name: f"only {count} of its {len(z)} rows could be predicted, {needed} are needed: "
         f"{_prediction_obstacle(rows.time_min, rows.inputs)}"
-        for name, count in zip(outputs, counts, strict=True)
-        if count < (needed := needed_values(count, len(z), FEWEST_ROWS, by_equations=by_equations))
-        and name not in left_out
+        for name, count, needed in zip(outputs, *_counts(z, by_equations=by_equations), strict=True)
+        if count < needed and name not in left_out
     }
+
+
+def _counts(columns: Array, *, by_equations: bool) -> tuple[list[int], list[int]]:
+    """Numbers of values, and of those that are needed, by the rows from the first value to the last."""
+    found = [np.flatnonzero(np.isfinite(column)) for column in columns.T]
+    counts = [int(at.size) for at in found]
+    spans = [int(at[-1] - at[0]) + 1 if at.size else 0 for at in found]
+    needed = [
+        needed_values(count, rows, FEWEST_ROWS, by_equations=by_equations)
+        for count, rows in zip(counts, spans, strict=True)
+    ]
+    return counts, needed
 
 
 def _prediction_obstacle(time_min: Array, inputs: Array) -> str:
@@ -385,7 +394,7 @@ def _prediction_obstacle(time_min: Array, inputs: Array) -> str:
     regular = np.count_nonzero(follows)
     if regular < 0.9 * follows.size:
         found = f"{regular} of {follows.size} spacings are within a tenth of the usual"
-        return f"do rows come one by one period? {found}; --resample auto makes them regular"
+        return f"do rows come one by one period? {found}; --resample auto, or resample in [monitor], makes them regular"
     known = int(np.count_nonzero(np.isfinite(inputs).all(axis=1)))
     if FEWEST_ROWS <= known < 0.9 * len(inputs):
         return f"{'the input has a value' if inputs.shape[1] == 1 else 'all inputs have values'} in {known} of them"
