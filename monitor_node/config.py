@@ -9,7 +9,7 @@ import msgspec
 
 from reactorwatch.contract.keys import DEFAULT_PLANT, check_plant
 from reactorwatch.description.read import find_process
-from reactorwatch.records.file_format import ResampleRule, parse_resampling
+from reactorwatch.records.file_format import INTERPOLATED, ResampleRule, parse_resampling
 from reactorwatch.runtime.config import check_bounds
 from reactorwatch.spc.charts.base import Setting, SignalSetting
 from reactorwatch.spc.charts.catalogue import CHARTS, chart
@@ -239,6 +239,9 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
         if self.process is not None and self.outputs == DEFAULT_SIGNALS["outputs"]:
             return  # the outputs are those of the process, which `watched_process` sets
         self._check_chart_signals()
+        for signal in () if self.resample_rule is None else self.resample_rule.methods:
+            if signal not in self.signals:
+                raise ValueError(f"resample has methods of inputs and outputs, {self.signals}, got {signal!r}")
         for signal in self.startup_modes:
             if signal not in self.modes:
                 raise ValueError(f"startup_modes are by mode, {self.modes}, got {signal!r}")
@@ -282,6 +285,10 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
         rule = parse_resampling(self.resample, "resample")
         if rule.period_s is None:
             raise ValueError(f"resample must state a period, such as 10 s, got {self.resample!r}")
+        if INTERPOLATED in (rule.method, *rule.methods.values()):
+            raise ValueError(
+                f"resample cannot interpolate to a value that has not come, got {self.resample!r}; use last"
+            )
         return rule
 
     @property

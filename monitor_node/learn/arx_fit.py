@@ -85,8 +85,8 @@ def _fit_model(models: ArxReference, index: int, rows: RowArrays) -> Array:
 
 
 def _with_dead_times(models: ArxReference, structure: Structure, rows: RowArrays, outputs: Array) -> Structure:
-    """A structure with the dead times that its residuals show, where the settings state none."""
-    if models.config.delay is not None or not structure.inputs:
+    """A structure with the dead times that its residuals show, where the settings state none and residuals count."""
+    if models.config.delay is not None or models.config.has_values_only or not structure.inputs:
         return structure
     data = Dataset(rows.time_min, rows.inputs, outputs[:, None], models.config.inputs, "output")
     try:
