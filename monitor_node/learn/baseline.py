@@ -12,7 +12,6 @@ from itertools import compress
 from math import log10
 from typing import NamedTuple
 
-import msgspec
 import numpy as np
 from msgspec.structs import replace
 
@@ -99,7 +98,7 @@ class TrainingResult(NamedTuple):
 
     def widened(self, factor: float, e: Array) -> "TrainingResult":
         """The same with limits that are wider by a factor, from other prewhitened residuals."""
-        learned = [msgspec.structs.replace(item, sd=item.sd * factor) for item in self.learned]
+        learned = [replace(item, sd=item.sd * factor) for item in self.learned]
         after_moves = self.after_moves._replace(size=max(self.after_moves.size / factor, 1.0))
         return self._replace(learned=learned, e=e / factor, after_moves=after_moves)
 
@@ -310,7 +309,8 @@ class _Choice:
 
 def _largest_correlation(z: Array) -> float:
     """Largest correlation of a residual with that of the row before: about 0 for noise, 0.5 and more for errors."""
-    return max(float(np.nanmean(column[1:] * column[:-1]) / np.nanmean(column**2)) for column in z.T)
+    columns = [np.nan_to_num(column) for column in z.T if np.isfinite(column).any()]
+    return max((float(column[1:] @ column[:-1] / (column @ column)) for column in columns), default=0.0)
 
 
 def _unscreened(z: Array) -> list[Screening]:

@@ -168,7 +168,7 @@ def return_level(statistics: Array, arl0: float) -> float:
 
     >>> e = np.abs(np.random.default_rng(0).standard_normal(100_000))
     >>> round(return_level(e[:10_000], 10_000), 1), round(float(np.sort(e)[-10]), 1)
-    (4.1, 3.9)
+    (4.0, 3.9)
 
     Args:
         statistics: statistics of the training, shape (rows,); NaN where there is none.
