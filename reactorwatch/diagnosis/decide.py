@@ -4,7 +4,8 @@
 |---|---|---|
 | no explanation is better than the simulation as it is by `LEAST_GAIN` | nominal | right |
 | only unmodelled sources explain it, or a place explains it better than the catalogue | unknown | see below |
-| a law explains it, and no cause with an onset removes 95 % with nuisance | unknown | see below |
+| a law explains it, and no cause with an onset removes 95 % with nuisance, or it leaves more than the law and the \
+tolerance | unknown | see below |
 | with nuisance, what is left without a cause is within the tolerance, and the best cause is better than none by less \
 than `LEAST_GAIN`, is there from the beginning, changes the outputs by less than half of the tolerance or removes less \
 than 0.8 | nominal | right |
@@ -177,7 +178,7 @@ def decide(
     best = graded[0]
     is_small = best.profile == CONSTANT.name or best.effect < SMALL_EFFECT or best.share < LARGE_SHARE
     is_small = is_small or best.lead < LEAST_GAIN
-    if is_law and (best.share < EXPLAINS or best.profile in (CONSTANT.name, FREE_NAME)):
+    if is_law and (best.share < EXPLAINS or best.profile in (CONSTANT.name, FREE_NAME) or best.left > max(left, 1.0)):
         return Verdict(verdict, grade_of(verdict, max(item.share for item in graded), left))
     if is_small and none.left <= 1.0:
         return Verdict(NOMINAL, RIGHT, with_nuisance=True)

@@ -137,8 +137,8 @@ def answer_exactly(exact: Exact, problem: Problem, about_record: Sequence[str]) 
     weights = _join_weights(weights, {item: _names(parts[item][0]) for item in listed})
     if corrections:
         alternatives = [item for item in alternatives if _names(parts[item][0]) != _names(shown)]
-    if verdict == AMBIGUOUS and corrections:
-        verdict = AMBIGUOUS if any(item.bic - best.bic < SURE for item in alternatives) else NAMED
+        if verdict == AMBIGUOUS and not any(item.bic - best.bic < SURE for item in alternatives):
+            verdict = NAMED
     experiment = _experiment(best, alternatives, exact, problem)
     if isinstance(experiment, str):
         remarks.append(experiment)

@@ -218,7 +218,7 @@ class _Comparison:
         fits = self._fit_all(_choose(self._rank(self._linearise(theta, simulated), noise), LAST), theta, noise)
         return self._explanations(fits, noise) if any(item.hypothesis.kind == NONE for item in fits) else None
 
-    def _linearise(self, theta: Array, simulated: Simulated) -> "_Linear":
+    def _linearise(self, theta: Array, simulated: Simulated) -> _Linear:
         """Derivatives of the readings at the kept rows about a simulation."""
         sim, nuisance = self._simulation, self._nuisance
         found = nuisance.linearise(theta, simulated)
@@ -231,7 +231,7 @@ class _Comparison:
         residual, mask = self._fitter.residual(theta, simulated), self._fitter.mask
         return _Linear(theta, residual, mask(found.derivatives), mask(causes), found.slopes)
 
-    def _rank(self, linear: "_Linear", noise: Discrepancy) -> list[Hypothesis]:
+    def _rank(self, linear: _Linear, noise: Discrepancy) -> list[Hypothesis]:
         """All hypotheses by the linearised model, the likeliest first."""
         sim, nuisance, slopes = self._simulation, self._nuisance, linear.slopes
         whitened, base, causes = (noise.whiten(item) for item in (linear.residual, linear.base, linear.causes))

@@ -82,10 +82,9 @@ class Fitted:
 
     def log_evidence_with(self, discrepancy: Discrepancy) -> float:
         """The same with another discrepancy, the parameters and their share of the evidence as they are."""
-        values, result = np.count_nonzero(self.residual, axis=0), self.log_evidence
-        for sign, noise in ((1.0, self.discrepancy), (-1.0, discrepancy)):
-            result += sign * float(values @ np.log(noise.sd) + 0.5 * np.sum(noise.whiten(self.residual) ** 2))
-        return result
+        values, white = np.count_nonzero(self.residual, axis=0), discrepancy.whiten(self.residual)
+        gained = values @ np.log(self.discrepancy.sd / discrepancy.sd)
+        return self.log_evidence + float(gained + 0.5 * (np.sum(self.white_residual**2) - np.sum(white**2)))
 
     def residual_without(self, hidden: NDArray[np.bool_]) -> Array:
         """Residual at these of the kept rows of a fit to the others, by the derivatives of this fit."""

@@ -67,6 +67,7 @@ class Screen:
         self._ff, self._fr = np.einsum("ij,ij->j", flat, flat), flat.T @ residual
         self._hh = np.stack([hats[:, k].T @ hats[:, k] for k in range(effects)])
         self._hr = (curves.T @ residual).reshape(effects, KNOTS)
+        self._with_nuisance = {prior: self._solve(nuisance.sds(prior)) for prior in nuisance.priors}
 
     def rank(self) -> list[Hypothesis]:
         """All hypotheses, the likeliest first."""
@@ -92,8 +93,8 @@ class Screen:
         width, result = WIDTH * float(self._nuisance.simulation.typical[effect]), []
         for item in ranked:
             if item.cause == (STEP, effect):
-                lower, z, none = self._solve(self._nuisance.sds(item.prior))
-                with_base = solve_triangular(lower, self._nuisance.sds(item.prior)[:, None] * bf, lower=True)
+                sds, (lower, z, none) = self._nuisance.sds(item.prior), self._with_nuisance[item.prior]
+                with_base = solve_triangular(lower, sds[:, None] * bf, lower=True)
                 gain, sizes = _gains(ff, fr, with_base, z, width)
                 best = int(np.argmax(gain))
                 evidence = none + gain[best] + log(float(np.mean(np.exp(gain - gain[best]))))
@@ -103,7 +104,7 @@ class Screen:
 
     def _with_prior(self, prior: Prior) -> Iterator[Hypothesis]:
         sds = self._nuisance.sds(prior)
-        lower, z, none = self._solve(sds)
+        lower, z, none = self._with_nuisance[prior]
         yield Hypothesis(NONE, -1, prior, log_evidence=none)
         for index, width in self._widths.items():
             wider = sds.copy()

@@ -21,8 +21,9 @@ from reactorwatch.diagnosis.fitting.descent import Equations, descend
 from reactorwatch.diagnosis.fitting.profiles import Signal
 from reactorwatch.diagnosis.inexact.answer import relative_delays
 from reactorwatch.diagnosis.inexact.explain import Explained, Explanation, explain
-from reactorwatch.diagnosis.inexact.hypotheses import CONSTANT, STEP, WIDTH, Courses
-from reactorwatch.diagnosis.inexact.noise import estimate_discrepancy
+from reactorwatch.diagnosis.inexact.fit import Fitter
+from reactorwatch.diagnosis.inexact.hypotheses import CONSTANT, NONE, STEP, WIDTH, Courses, Hypothesis
+from reactorwatch.diagnosis.inexact.noise import estimate_discrepancy, white
 from reactorwatch.diagnosis.inexact.nuisance import Nuisance, Prior
 from reactorwatch.diagnosis.inexact.screen import Screen
 from reactorwatch.diagnosis.inexact.simulation import InexactSimulation, ProductForcing
@@ -205,6 +206,18 @@ def test_a_descent_ends_where_its_equations_cannot_be_solved(known: float | None
         return None if known is None else (np.array([[known, 0.0], [0.0, 1.0]]), np.ones(2))
 
     assert descend(start, equations, lambda point, step: None, 5) is start
+
+
+def test_a_simulation_that_has_left_the_record_is_no_fit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An unstable plant may end in numbers whose squares are none."""
+    _, run, nuisance = plant()
+    step = nuisance.simulation._step_after_step
+    monkeypatch.setattr(
+        step, "map", lambda *given: [1e200 * (1.0 + np.abs(item)) for item in type(step).map(step, *given)]
+    )
+    measured, theta = run.measured[nuisance.simulation.rows], np.zeros(nuisance.size)
+    fitter = Fitter(nuisance, Courses(TIME, PERIOD_MIN), {}, measured)
+    assert fitter.fit(Hypothesis(NONE, -1, nuisance.priors[0]), theta, white(np.ones(measured.shape[1]))) is None
 
 
 def test_without_effects_there_is_no_explanation() -> None:
