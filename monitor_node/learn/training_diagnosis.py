@@ -42,7 +42,7 @@ from reactorwatch.kalman.filter_states import (
     select_effects,
     widen_model,
 )
-from reactorwatch.kalman.noise_estimation import NoiseFit
+from reactorwatch.kalman.noise_estimation import NoiseFit, resolution_sd
 from reactorwatch.process import DEFAULT_PROCESS, effects_of, own_effects
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.extended_model import parse_extended_model, stored_model
@@ -246,6 +246,9 @@ LEAST_ROWS = 100
 LEAST_GAIN = 8.0
 """Gain of log likelihood beyond which something is taken for a part of the plant."""
 
+MOST_DISTURBANCES = 4
+"""Number of disturbances from which on no further one is sought: a filter of so many more states would be slow."""
+
 MOVE_ROWS = 60
 """Number of rows after a move of an input that are predicted."""
 
@@ -260,21 +263,26 @@ def find_uncertain(model: ProcessModel, outputs: tuple[str, ...], rows: RowArray
         plain = fitter.fit(())
     x = np.nanmedian(fitter.filter(plain).x, axis=0)
     constants = tuple(f"{CONSTANT} {name}" for name in select_effects(model, x, np.nanmedian(rows.inputs, axis=0)))
-    best = fitter.fit(constants)
-    candidates = [f"{WANDER} {item.name}" for item in model.states if item.name not in model.at_rest]
-    candidates += [f"{NOISE} {name}" for name in outputs]
-    while len(best.uncertain) < len(constants) + 2 and fitter.are_coloured(best):
-        fits = (fitter.fit((*best.uncertain, item)) for item in candidates if item not in best.uncertain)
-        found = min(fits, key=lambda item: item.noise.loss)
-        if found.noise.loss > best.noise.loss - LEAST_GAIN:
+    wide = fitter.fit(constants)
+    best = wide if wide.noise.loss < plain.noise.loss - LEAST_GAIN else plain
+    most = len(best.uncertain) + MOST_DISTURBANCES
+    inputs = tuple(f"{WANDER} {name}" for name in model.input_names)
+    candidates = [(f"{WANDER} {item.name}",) for item in model.states if item.name not in model.at_rest]
+    candidates += [(item,) for item in inputs] + [(f"{NOISE} {name}",) for name in outputs]
+    candidates += [inputs] if len(inputs) > 1 else []  # one alone explains little of what several do
+    while len(best.uncertain) < most and fitter.are_coloured(best):
+        fits = [fitter.fit((*best.uncertain, *item)) for item in candidates if not {*item} & {*best.uncertain}]
+        found = min(fits, key=lambda item: item.noise.loss + LEAST_GAIN * len(item.uncertain))
+        if found.noise.loss > best.noise.loss - LEAST_GAIN * (len(found.uncertain) - len(best.uncertain)):
             break
         best = found
-    if best.uncertain != constants or plain.noise.loss - best.noise.loss > LEAST_GAIN:
-        learned = (best.noise.parameters[name] for name in learned_parameters(best.uncertain))
-        return Uncertain(best.uncertain, tuple(learned))
-    certain, uncertain = fitter.sds_after_moves(plain), fitter.sds_after_moves(best)
-    # the training leaves open how the plant follows
-    return Uncertain(constants) if np.any(uncertain > 1.25 * certain) else Uncertain()
+    if not {*constants} <= {*best.uncertain}:
+        wide = fitter.fit((*constants, *best.uncertain)) if best.uncertain else wide
+        certain, uncertain = fitter.sds_after_moves(best), fitter.sds_after_moves(wide)
+        if np.any(uncertain > 1.25 * certain):  # the training leaves open how the plant follows
+            best = wide
+    learned = (best.noise.parameters[name] for name in learned_parameters(model, best.uncertain))
+    return Uncertain(best.uncertain, tuple(learned))
 
 
 def describe_uncertain(uncertain: Sequence[str]) -> str:
@@ -306,7 +314,7 @@ class _NoiseFitter:
 
     def fit(self, uncertain: tuple[str, ...]) -> _Fit:
         """Fit the noise of the model with uncertain parts."""
-        model, smallest = self._model, [1e-6] * len(self._outputs)
+        model, smallest = self._model, [max(resolution_sd(column), 1e-6) for column in self._rows.outputs.T]
         found = fit_training_noise(model, self._outputs, self._rows, smallest, uncertain)
         return _Fit(uncertain, found, Filter(widen_model(model, uncertain), found.levels, found.parameters))
 
