@@ -33,6 +33,7 @@ from reactorwatch.diagnosis.whiteness import minus_log10_p
 from reactorwatch.errors import InputError
 from reactorwatch.kalman.batch import GATE, LONGEST_GAP_MIN, FilterRecord, FilterResult
 from reactorwatch.kalman.ekf import Filter, FilterState
+from reactorwatch.kalman.ekf_step import NoiseLevels
 from reactorwatch.kalman.filter_states import (
     CONSTANT,
     NOISE,
@@ -42,7 +43,7 @@ from reactorwatch.kalman.filter_states import (
     select_effects,
     widen_model,
 )
-from reactorwatch.kalman.noise_estimation import NoiseFit, resolution_sd
+from reactorwatch.kalman.noise_estimation import NoiseFit, losses_nearby, resolution_sd
 from reactorwatch.process import DEFAULT_PROCESS, effects_of, own_effects
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.extended_model import parse_extended_model, stored_model
@@ -249,6 +250,9 @@ LEAST_GAIN = 8.0
 MOST_DISTURBANCES = 4
 """Number of disturbances from which on no further one is sought: a filter of so many more states would be slow."""
 
+MOST_FITTED = 3
+"""Number of disturbances that are fitted to find the next: those that are likeliest with the other noise as it is."""
+
 MOVE_ROWS = 60
 """Number of rows after a move of an input that are predicted."""
 
@@ -271,7 +275,9 @@ def find_uncertain(model: ProcessModel, outputs: tuple[str, ...], rows: RowArray
     candidates += [(item,) for item in inputs] + [(f"{NOISE} {name}",) for name in outputs]
     candidates += [inputs] if len(inputs) > 1 else []  # one alone explains little of what several do
     while len(best.uncertain) < most and fitter.are_coloured(best):
-        fits = [fitter.fit((*best.uncertain, *item)) for item in candidates if not {*item} & {*best.uncertain}]
+        further = [item for item in candidates if not {*item} & {*best.uncertain}]
+        further.sort(key=lambda item: fitter.loss_with(best, item) + LEAST_GAIN * len(item))
+        fits = [fitter.fit((*best.uncertain, *item)) for item in further[:MOST_FITTED]]
         found = min(fits, key=lambda item: item.noise.loss + LEAST_GAIN * len(item.uncertain))
         if found.noise.loss > best.noise.loss - LEAST_GAIN * (len(found.uncertain) - len(best.uncertain)):
             break
@@ -317,6 +323,23 @@ class _NoiseFitter:
         model, smallest = self._model, [max(resolution_sd(column), 1e-6) for column in self._rows.outputs.T]
         found = fit_training_noise(model, self._outputs, self._rows, smallest, uncertain)
         return _Fit(uncertain, found, Filter(widen_model(model, uncertain), found.levels, found.parameters))
+
+    def loss_with(self, item: _Fit, added: tuple[str, ...]) -> float:
+        """Smallest loss with disturbances of several sizes added to a fit, its noise levels as they are."""
+        model, levels = widen_model(self._model, (*item.uncertain, *added)), item.noise.levels
+        known = dict(zip(item.filter.model.state_names, levels.process_sd, strict=True))
+        new = np.array([name not in known for name in model.state_names])
+        scales = np.array([state.scale for state in model.states])
+        before = np.array([known.get(name, 0.0) for name in model.state_names])
+        columns = model_outputs(self._model, self._outputs, self._rows.outputs)
+        tried = [
+            NoiseLevels(levels.measurement_sd, tuple(np.where(new, share * scales, before).tolist()))
+            for share in (3.0, 1.0, 0.3, 0.1, 0.03, 0.01)
+        ]
+        record = FilterRecord(self._rows.time_min, self._rows.inputs, columns)
+        smallest = [1e-9] * len(model.outputs)  # levels that were fitted keep the true bounds
+        changes = dict(item.noise.parameters)
+        return min(losses_nearby(model.with_values(changes) if changes else model, record, smallest, tried))
 
     def drop_disturbances(self, item: _Fit) -> bool:
         """Leave out disturbed intervals and outliers, as a training does; returns true if there are any."""
