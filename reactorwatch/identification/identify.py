@@ -12,9 +12,10 @@ from reactorwatch.arrays import Array
 from reactorwatch.errors import InputError, UnfitRecordError, describe_unknown
 from reactorwatch.identification.checks import DEFAULT_LAGS, check_record, independence, whiteness
 from reactorwatch.identification.data import Dataset, RunPlan, plan_run, rows_of
+from reactorwatch.identification.dead_time import DelayChoice, find_dead_times, name_delays, resolve_delay
 from reactorwatch.identification.least_squares import SINGULAR_CONDITION, LeastSquares
 from reactorwatch.identification.linear import fit_linear, unscale
-from reactorwatch.identification.linear_model import Kind, LinearModel, fit_percent, simulate
+from reactorwatch.identification.linear_model import Kind, LinearModel, fit_percent, free_run_percent, simulate
 from reactorwatch.identification.polynomial import PolynomialModel, fit_narx, fit_noe, name_product
 from reactorwatch.identification.rls import RecursiveLeastSquares
 from reactorwatch.identification.structure import Scaling, Structure
@@ -43,7 +44,8 @@ class ModelForm:
         model: `arx`, `oe`, `armax`, `bj` (Box-Jenkins), `narx` or `noe` (polynomials of degree 2, fitted by one-step
             prediction, and of degree 3, fitted by simulation).
         order: number of lags of the output, of each input and of the disturbance.
-        delay: samples from a move of an input to its first effect, at least 1.
+        delay: samples from a move of an input to its first effect, at least 1; one by the name of each input; or
+            `auto`, which searches them in the rows to fit.
         recursive: whether an ARX model is learned row by row, by recursive least squares, instead of from all rows at
             once.
         forgetting: forgetting factor of recursive least squares, in (0, 1].
@@ -54,7 +56,7 @@ class ModelForm:
 
     model: str = "arx"
     order: int = 3
-    delay: int = 1
+    delay: DelayChoice = 1
     recursive: bool = False
     forgetting: float = 1.0
 
@@ -145,7 +147,7 @@ class Identification(Result, frozen=True):
     Attributes:
         model: `arx`, `oe`, `armax`, `bj`, `narx` or `noe`.
         order: n.
-        delay: delay in samples.
+        delay: delay in samples; by the names of the inputs where they differ.
         output: name of the output.
         rows: number of rows of the fitted part.
         recursive: whether it was learned row by row.
@@ -167,7 +169,7 @@ class Identification(Result, frozen=True):
 
     model: str
     order: int
-    delay: int
+    delay: int | dict[str, int]
     output: str
     rows: int
     recursive: bool
@@ -209,8 +211,10 @@ def identify(
             rows, a signal that does not move, inputs that do not excite the order.
     """
     form = form or ModelForm()
-    structure = Structure.of_order(form.order, form.delay, data.inputs.shape[1])
     fitted, held_out = data.split(data.rows // 2) if validation is None else (data, validation)
+    if form.delay == "auto":
+        fitted.check_movement()
+    structure = Structure.of_order(form.order, resolve_delay(form.delay, fitted), data.inputs.shape[1])
     _check_rows(structure, form, fitted, held_out, settle)
     fitted.check_movement()
     checks = {check.name: check.result for check in check_record(structure, *fitted.arrays)}
@@ -227,8 +231,10 @@ def identify(
         white = whiteness(residuals, lags, of_own_past).minus_log10_p
         checks["whiteness"] = _verdict(white, "the residuals are correlated with each other")
         if structure.inputs:
-            free = independence(residuals, fitted.inputs, form.delay, time=fitted.time)
-            checks["independence"] = _verdict(free.minus_log10_p, "the residuals are correlated with past inputs")
+            free = independence(residuals, fitted.inputs, structure.delay, time=fitted.time)
+            wrong = "the residuals are correlated with past inputs"
+            checks["independence"] = _verdict(free.minus_log10_p, wrong, partial(_other_dead_time, structure, fitted))
+    checks["stability"] = _stability(structure, fitted)
     predicted, run = model.predict(*held_out.arrays)[:, 0], free_run(model, held_out, settle)
     predicted[:settle] = np.nan
     y = held_out.output[:, 0]
@@ -236,12 +242,12 @@ def identify(
     return Identification(
         model=form.model,
         order=form.order,
-        delay=form.delay,
+        delay=name_delays(structure.delay, data.input_names),
         output=data.output_name,
         rows=fitted.rows,
         recursive=form.recursive,
         sd=Deviations(**deviations),
-        fit_percent=FitPercent(fit_percent(y, predicted), fit_percent(y, run)),
+        fit_percent=FitPercent(fit_percent(y, predicted), free_run_percent(model, y, run)),
         whiteness_minus_log10_p=white,
         checks=checks,
         rmse=Rmse(_rmse(y, predicted), _rmse(y, run)) if validation is not None or settle else None,
@@ -313,8 +319,9 @@ def _check_rows(structure: Structure, form: ModelForm, fitted: Dataset, held_out
     least = structure.history + structure.parameters + of_noise
     if fitted.rows <= least:
         raise UnfitRecordError(
-            f"order {form.order} with delay {form.delay} needs more than {least} rows to fit, the first half of the "
-            f"record unless another validates, got {fitted.rows}; lower the order, or record for longer"
+            f"order {form.order} with delay {max(structure.delays, default=1)} needs more than {least} rows to fit, "
+            f"the first half of the record unless another validates, got {fitted.rows}; "
+            "lower the order, or record for longer"
         )
     if settle < 0:
         raise InputError(f"settle must be at least 0 rows, got {settle}")
@@ -386,10 +393,36 @@ def _rmse(measured: Array, predicted: Array) -> float:
     return float(np.sqrt(np.mean(errors**2))) if errors.size else math.nan
 
 
-def _verdict(minus_log10_p: float, wrong: str) -> str:
+def _verdict(minus_log10_p: float, wrong: str, find_cause: Callable[[], str] = str) -> str:
     if minus_log10_p < WORST_MINUS_LOG10_P:
         return "ok"
-    return f"{wrong}, -log10 p = {minus_log10_p:.1f}: the model leaves something out, and its sd are too small"
+    cause = find_cause() or "the model leaves something out"
+    return f"{wrong}, -log10 p = {minus_log10_p:.1f}: {cause}, and its sd are too small"
+
+
+def _other_dead_time(structure: Structure, data: Dataset) -> str:
+    """Dead times that an ARX model predicts better with than with those of a structure; empty if there are none."""
+    try:
+        found = Structure(structure.output_lags, structure.input_lags, find_dead_times(data), structure.inputs)
+        here, there = (fit_linear("arx", item, *data.arrays).noise_sd for item in (structure, found))
+    except InputError:  # too few rows to search
+        return ""
+    differences = np.abs(np.subtract(found.delays, structure.delays))
+    if there >= here or max(differences) <= 1:  # the search is right to a row
+        return ""
+    if isinstance(found.delay, int):
+        return f"dead time {found.delay} rows, where the model has {structure.delay} (--delay {found.delay})"
+    named = [f"{name}={rows}" for name, rows in zip(data.input_names, found.delays, strict=True)]
+    return f"dead time {' '.join(named)} rows, where the model has others (--delay {','.join(named)})"
+
+
+def _stability(structure: Structure, data: Dataset) -> str:
+    """Check that the plant is stable, by its ARX model, which alone may have a pole outside the unit circle."""
+    try:
+        pole = fit_linear("arx", structure, *data.arrays).instability
+    except InputError as refusal:
+        return f"cannot tell: {refusal}"
+    return f"the plant is unstable: its ARX model has {pole}, and a simulation diverges" if pole else "ok"
 
 
 def _floats(values: Iterable[float]) -> Coefficients:
