@@ -349,14 +349,17 @@ def fit_training_noise(
     columns, smallest = model_outputs(model, outputs, rows.outputs), [1e-6] * len(model.outputs)
     for i, sd in zip(output_indices(model, outputs), smallest_sd, strict=True):
         smallest[i] = sd
-    learned = learned_parameters(model, uncertain)
-    wide = widen_model(model, uncertain)
-    memory_min = WANDER_ROWS * float(np.median(np.diff(rows.time_min)))
-    starts = {name: memory_min for name in learned if name.endswith(".wander_min")}
+    wide, starts = widen_model(model, uncertain), first_times(model, uncertain, rows)
     return fit_noise(
         wide.with_values(starts) if starts else wide,
         FilterRecord(rows.time_min, _mask_before_missing(rows.time_min, rows.inputs), columns),
         smallest,
-        learned,
+        learned_parameters(model, uncertain),
         nearby=noise_starts(model, uncertain, columns, smallest),
     )
+
+
+def first_times(model: ProcessModel, uncertain: tuple[str, ...], rows: RowArrays) -> dict[str, float]:
+    """Time constants in minutes of inputs that wander at which their search starts, by name of the parameter."""
+    first_min = WANDER_ROWS * float(np.median(np.diff(rows.time_min)))
+    return {name: first_min for name in learned_parameters(model, uncertain) if name.endswith(".wander_min")}

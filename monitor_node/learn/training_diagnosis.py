@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
-from monitor_node.learn.process_reference import fit_training_noise, model_outputs, output_indices
+from monitor_node.learn.process_reference import first_times, fit_training_noise, model_outputs, output_indices
 from monitor_node.learn.training_rows import RowArrays, TrainingRows, screen_baseline
 from reactorwatch.arrays import Array
 from reactorwatch.contract.messages_pb2 import Baseline
@@ -164,7 +164,7 @@ def diagnose_training(job: DiagnosisJob) -> Finding:
     if extended is not None:
         uncertain = find_uncertain(parse_extended_model(_json(extended)).build(), outputs, rows)
     if uncertain.names:
-        why = f"{why}; {describe_uncertain(uncertain.names)}"
+        why = f"{why}; {describe_uncertain(uncertain.names, model.input_names)}"
     if extended is None and not uncertain.names:
         return Finding(job.first_ns, verdict, why)
     found = parse_extended_model(job.equations).to_object() if extended is None else extended
@@ -271,8 +271,9 @@ def find_uncertain(model: ProcessModel, outputs: tuple[str, ...], rows: RowArray
     best = wide if wide.noise.loss < plain.noise.loss - LEAST_GAIN else plain
     most = len(best.uncertain) + MOST_DISTURBANCES
     inputs = tuple(f"{WANDER} {name}" for name in model.input_names)
-    candidates = [(f"{WANDER} {item.name}",) for item in model.states if item.name not in model.at_rest]
-    candidates += [(item,) for item in inputs] + [(f"{NOISE} {name}",) for name in outputs]
+    balances = [item.name for item in model.states if item.name not in model.at_rest]
+    singles = [*(f"{WANDER} {name}" for name in balances), *inputs, *(f"{NOISE} {name}" for name in outputs)]
+    candidates: list[tuple[str, ...]] = [(item,) for item in singles]
     candidates += [inputs] if len(inputs) > 1 else []  # one alone explains little of what several do
     while len(best.uncertain) < most and fitter.are_coloured(best):
         further = [item for item in candidates if not {*item} & {*best.uncertain}]
@@ -291,15 +292,19 @@ def find_uncertain(model: ProcessModel, outputs: tuple[str, ...], rows: RowArray
     return Uncertain(best.uncertain, tuple(learned))
 
 
-def describe_uncertain(uncertain: Sequence[str]) -> str:
+def describe_uncertain(uncertain: Sequence[str], inputs: Sequence[str]) -> str:
     """Describe the additional states of a filter in words."""
-    parts = {
-        WANDER: [item.split(" ", 1)[1] for item in uncertain if item.startswith(f"{WANDER} ")],
-        NOISE: [item.split(" ", 1)[1] for item in uncertain if item.startswith(f"{NOISE} ")],
-    }
-    words = [f"a disturbance of the balance of {name} wanders" for name in parts[WANDER]]
+    parts: dict[str, list[str]] = {CONSTANT: [], WANDER: [], NOISE: []}
+    for kind, name in (item.split(" ", 1) for item in uncertain):
+        parts[kind].append(name)
+    words = [
+        f"{name} wanders about its recorded value"
+        if name in inputs
+        else f"a disturbance of the balance of {name} wanders"
+        for name in parts[WANDER]
+    ]
     words += [f"the noise of {name} has memory" for name in parts[NOISE]]
-    if any(not is_disturbance(item) for item in uncertain):
+    if parts[CONSTANT]:
         words.append("limits allow for what the training leaves open of the constants")
     return ", ".join(words)
 
@@ -338,8 +343,8 @@ class _NoiseFitter:
         ]
         record = FilterRecord(self._rows.time_min, self._rows.inputs, columns)
         smallest = [1e-9] * len(model.outputs)  # levels that were fitted keep the true bounds
-        changes = dict(item.noise.parameters)
-        return min(losses_nearby(model.with_values(changes) if changes else model, record, smallest, tried))
+        times = first_times(self._model, (*item.uncertain, *added), self._rows) | dict(item.noise.parameters)
+        return min(losses_nearby(model.with_values(times) if times else model, record, smallest, tried))
 
     def drop_disturbances(self, item: _Fit) -> bool:
         """Leave out disturbed intervals and outliers, as a training does; returns true if there are any."""

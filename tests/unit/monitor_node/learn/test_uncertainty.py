@@ -68,9 +68,6 @@ def test_noise_with_memory_is_coloured_noise(memory: tuple[float, float]) -> Non
     assert disturbances(Kind("noise with memory", noise_memory=memory), 0) == {"noise T"}
 
 
-INPUTS_WANDER = {"wander F1", "wander F2"}
-
-
 @cache
 def fit_two_tanks(seed: int, wandering: tuple[bool, bool], resolution: float) -> tuple[Uncertain, Array]:
     """What the first 1,000 rows show, and the innovations of 9,000 later ones."""
@@ -108,9 +105,9 @@ def test_a_training_of_few_rows_is_left_as_it_is() -> None:
 
 
 def test_uncertainty_is_stated_in_words() -> None:
-    assert describe_uncertain(("constant volume", "wander T", "noise C")) == (
-        "a disturbance of the balance of T wanders, the noise of C has memory, limits allow for what the training "
-        "leaves open of the constants"
+    assert describe_uncertain(("constant volume", "wander T", "wander qc", "noise C"), ("qc",)) == (
+        "a disturbance of the balance of T wanders, qc wanders about its recorded value, the noise of C has memory, "
+        "limits allow for what the training leaves open of the constants"
     )
 
 
