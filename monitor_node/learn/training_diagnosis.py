@@ -250,8 +250,8 @@ LEAST_GAIN = 8.0
 MOST_DISTURBANCES = 4
 """Number of disturbances from which on no further one is sought: a filter of so many more states would be slow."""
 
-MOST_FITTED = 3
-"""Number of disturbances that are fitted to find the next: those that are likeliest with the other noise as it is."""
+MOST_FITTED = 2
+"""Number of single disturbances that are fitted to find the next: the likeliest with the other noise as it is."""
 
 MOVE_ROWS = 60
 """Number of rows after a move of an input that are predicted."""
@@ -273,12 +273,12 @@ def find_uncertain(model: ProcessModel, outputs: tuple[str, ...], rows: RowArray
     inputs = tuple(f"{WANDER} {name}" for name in model.input_names)
     balances = [item.name for item in model.states if item.name not in model.at_rest]
     singles = [*(f"{WANDER} {name}" for name in balances), *inputs, *(f"{NOISE} {name}" for name in outputs)]
-    candidates: list[tuple[str, ...]] = [(item,) for item in singles]
-    candidates += [inputs] if len(inputs) > 1 else []  # one alone explains little of what several do
     while len(best.uncertain) < most and fitter.are_coloured(best):
-        further = [item for item in candidates if not {*item} & {*best.uncertain}]
-        further.sort(key=lambda item: fitter.loss_with(best, item) + LEAST_GAIN * len(item))
-        fits = [fitter.fit((*best.uncertain, *item)) for item in further[:MOST_FITTED]]
+        further: list[tuple[str, ...]] = [(item,) for item in singles if item not in best.uncertain]
+        further = sorted(further, key=lambda item: fitter.loss_with(best, item))[:MOST_FITTED]
+        if not {*inputs} & {*best.uncertain} and len(inputs) > 1:
+            further.append(inputs)  # one alone explains little of what several do
+        fits = [fitter.fit((*best.uncertain, *item)) for item in further]
         found = min(fits, key=lambda item: item.noise.loss + LEAST_GAIN * len(item.uncertain))
         if found.noise.loss > best.noise.loss - LEAST_GAIN * (len(found.uncertain) - len(best.uncertain)):
             break
