@@ -96,7 +96,7 @@ class TrainingResult(NamedTuple):
     after_moves: AfterMoves
     weakness: str
 
-    def widened(self, factor: float, e: Array) -> "TrainingResult":
+    def widen(self, factor: float, e: Array) -> "TrainingResult":
         """The same with limits that are wider by a factor, from other prewhitened residuals."""
         learned = [replace(item, sd=item.sd * factor) for item in self.learned]
         after_moves = self.after_moves._replace(size=max(self.after_moves.size / factor, 1.0))
@@ -146,7 +146,7 @@ def learn_baseline(
     if not any(evaluated):
         refused = "; ".join(map(": ".join, left_out.items()))
     elif refused and last_chance:
-        refused, screenings = "", _unscreened(z)
+        refused, screenings = "", _keep_all(z)
     usable = np.column_stack([item.usable for item in screenings]) & np.array(evaluated)
     disturbed = np.column_stack([item.left_out for item in screenings]) | ~np.array(evaluated)
     all_z, z = z, np.where(usable, z, np.nan)
@@ -303,7 +303,7 @@ class _Choice:
             if not (reference.errs and (again[0].errs or _largest_correlation(again[1]) > 0.3)):
                 return _Candidate(*again, screenings)
         if reference.errs:  # what looks disturbed are its errors
-            screenings = _unscreened(z)
+            screenings = _keep_all(z)
         return _Candidate(reference, z, screenings)
 
 
@@ -313,7 +313,7 @@ def _largest_correlation(z: Array) -> float:
     return max((float(column[1:] @ column[:-1] / (column @ column)) for column in columns), default=0.0)
 
 
-def _unscreened(z: Array) -> list[Screening]:
+def _keep_all(z: Array) -> list[Screening]:
     """Screening of residuals that leaves nothing out."""
     none = np.zeros(len(z), dtype=np.bool_)
     return [Screening(known, [], [], none, none) for known in np.isfinite(z).T]

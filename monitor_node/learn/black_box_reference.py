@@ -145,7 +145,7 @@ class BlackBoxReference(FilterReference):
             scale = float(np.nanmax(np.abs(held_out))) / LARGEST_ERROR
             residuals, sds = held_out * held_out_sds, held_out_sds * scale
             reference = cls(
-                BlackBoxMemory(model.scaled(scale), outputs, count, period_min, [1.0] * count, error_scale=scale)
+                BlackBoxMemory(model.scale_sds(scale), outputs, count, period_min, [1.0] * count, error_scale=scale)
             )
             reference._filter.run(inputs, known, follows)
             reference._filter.learning = False

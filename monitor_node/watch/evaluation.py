@@ -216,7 +216,7 @@ class Evaluation:
         rows, outputs = trained.e.shape
         e = np.column_stack([np.roll(column, i * rows // outputs) for i, column in enumerate(trained.e.T)])
         detectors = self.charts.design.detectors(trained.learned, e, arl0)
-        return trained.widened(error_factor(trained.e, detectors, arl0), e)
+        return trained.widen(error_factor(trained.e, detectors, arl0), e)
 
     def check_training(
         self, trained: TrainingResult, model: ProcessModel | None, period_ns: float, units: Sequence[str]

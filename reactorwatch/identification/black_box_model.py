@@ -123,7 +123,7 @@ class BlackBoxModel(msgspec.Struct, frozen=True):
         sizes = (shape.outputs, shape.inputs, shape.lags, shape.degree, shape.delay)
         return cls(*sizes, rows, effective, gain, centres, spreads, r, q, numbers)
 
-    def scaled(self, factor: float) -> Self:
+    def scale_sds(self, factor: float) -> Self:
         """The same model with standard deviations that are larger by a factor; its predictions are the same."""
         variances = factor**2 * np.array(self.r), factor**2 * np.array(self.q)
         scaling = np.array(self.centres), np.array(self.spreads)

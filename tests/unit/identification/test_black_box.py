@@ -301,6 +301,6 @@ def test_held_out_blocks_separate_a_wrong_model_from_a_right_one() -> None:
 
 def test_larger_variances_leave_predictions_as_they_are() -> None:
     model, inputs, outputs = trained()
-    runs = [BlackBoxFilter(item).run(inputs, outputs, following(TRAINING)) for item in (model, model.scaled(3.0))]
+    runs = [BlackBoxFilter(item).run(inputs, outputs, following(TRAINING)) for item in (model, model.scale_sds(3.0))]
     np.testing.assert_allclose(runs[1][0], runs[0][0], atol=1e-9)
     np.testing.assert_allclose(runs[1][1], 3.0 * runs[0][1], rtol=1e-9)
