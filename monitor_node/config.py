@@ -9,7 +9,7 @@ import msgspec
 
 from reactorwatch.contract.keys import DEFAULT_PLANT, check_plant
 from reactorwatch.description.read import find_process
-from reactorwatch.records.file_format import INTERPOLATED, ResampleRule, parse_resampling
+from reactorwatch.records.file_format import ResampleRule, parse_resampling
 from reactorwatch.runtime.config import check_bounds
 from reactorwatch.spc.charts.base import Setting, SignalSetting
 from reactorwatch.spc.charts.catalogue import CHARTS, chart
@@ -285,10 +285,6 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
         rule = parse_resampling(self.resample, "resample")
         if rule.period_s is None:
             raise ValueError(f"resample must state a period, such as 10 s, got {self.resample!r}")
-        if INTERPOLATED in (rule.method, *rule.methods.values()):
-            raise ValueError(
-                f"resample cannot interpolate to a value that has not come, got {self.resample!r}; use last"
-            )
         return rule
 
     @property
