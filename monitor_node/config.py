@@ -9,6 +9,7 @@ import msgspec
 
 from reactorwatch.contract.keys import DEFAULT_PLANT, check_plant
 from reactorwatch.description.read import find_process
+from reactorwatch.records.file_format import ResampleRule, parse_resampling
 from reactorwatch.runtime.config import check_bounds
 from reactorwatch.spc.charts.base import Setting, SignalSetting
 from reactorwatch.spc.charts.catalogue import CHARTS, chart
@@ -119,7 +120,8 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
         units: unit by signal, as its process describes it: that of samples which name none, and, without equations,
             the unit in which a signal is judged.
         order: order of the ARX models.
-        delay: delay of the input in samples; with 1 it acts on the next sample.
+        delay: delay of the inputs in rows, of all or by input; with 1 they act on the next row. None: 1, unless
+            residuals of the training show a dead time.
         forgetting: forgetting factor of the adaptive model, in [0.5, 1]; with 1 it forgets nothing.
         training_min: duration of the training, in minutes of rows, one sampling period a row; time without rows does
             not count. None: see `training_length`.
@@ -148,6 +150,8 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
         longest_shelf_min: longest time for which an alarm may be shelved, in minutes of the plant.
         state_file: file of the monitor's full state, for a restart; None: it is not stored.
         state_every_s: storage interval in seconds; after a change of an alarm the state is stored at once.
+        resample: period of the rows that are made of the samples, such as `10 s`, with methods of signals behind it as
+            in `--resample`; None: the rows are those of the samples.
         reorder_rows: number of newer rows that may start before an incomplete row is emitted.
         snapshot_min: interval between published models, in minutes of the plant.
         health_period_s: interval between health messages, in seconds.
@@ -167,7 +171,7 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
     uncertain: dict[str, float] = msgspec.field(default_factory=dict)
     units: dict[str, str] = msgspec.field(default_factory=dict)
     order: Annotated[int, msgspec.Meta(ge=1, le=20)] = 3
-    delay: Annotated[int, msgspec.Meta(ge=1, le=100)] = 1
+    delay: Annotated[int, msgspec.Meta(ge=1, le=100)] | dict[str, int] | None = None
     forgetting: Annotated[float, msgspec.Meta(ge=0.5, le=1.0)] = 0.999
     training_min: Annotated[float, msgspec.Meta(ge=1e-3, le=1e6)] | None = None
     training_rows: Annotated[int, msgspec.Meta(ge=1, le=10_000)] | None = None
@@ -189,6 +193,7 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
     longest_shelf_min: Annotated[float, msgspec.Meta(ge=1e-3, le=1e6)] = 480.0
     state_file: str | None = None
     state_every_s: Annotated[float, msgspec.Meta(ge=0.1, le=3600.0)] = 5.0
+    resample: str | None = None
     reorder_rows: Annotated[int, msgspec.Meta(ge=1, le=1000)] = 8
     silence_periods: Annotated[float, msgspec.Meta(ge=1.5, le=1e6)] = 5.0
     snapshot_min: Annotated[float, msgspec.Meta(ge=1e-3, le=1e6)] = 5.0
@@ -217,6 +222,7 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
                 f"outputs must be at least one signal, and each signal have one role, "
                 f"got inputs {self.inputs} and outputs {self.outputs}{beside}"
             )
+        self.resample_rule  # noqa: B018 # checks it
         check_bounds(MonitorConfig, msgspec.structs.asdict(self))
         msgspec.structs.force_setattr(self, "reference", OLDER_REFERENCES.get(self.reference, self.reference))
         if self.training_min is not None and self.training_rows is not None:
@@ -234,6 +240,9 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
         if self.process is not None and self.outputs == DEFAULT_SIGNALS["outputs"]:
             return  # the outputs are those of the process, which `watched_process` sets
         self._check_chart_signals()
+        for signal in () if self.resample_rule is None else self.resample_rule.methods:
+            if signal not in self.signals:
+                raise ValueError(f"resample has methods of inputs and outputs, {self.signals}, got {signal!r}")
         for signal in self.startup_modes:
             if signal not in self.modes:
                 raise ValueError(f"startup_modes are by mode, {self.modes}, got {signal!r}")
@@ -248,6 +257,10 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
         for parameter, sd in self.uncertain.items():
             if not 0.0 < sd < inf:
                 raise ValueError(f"uncertain: the standard deviation of {parameter} must be positive, got {sd:g}")
+        if isinstance(self.delay, dict) and (
+            set(self.delay) != set(self.inputs) or not all(1 <= rows <= 100 for rows in self.delay.values())
+        ):
+            raise ValueError(f"delay must be 1 to 100 rows of each input, {self.inputs}, got {self.delay}")
         for signal, step in self.resolution.items():
             if signal not in self.outputs:
                 raise ValueError(f"resolution is by output, {self.outputs}, got {signal!r}")
@@ -264,6 +277,16 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
         for signal in self.priorities:
             if signal not in self.outputs:
                 raise ValueError(f"priorities are by output, {self.outputs}, got {signal!r}")
+
+    @property
+    def resample_rule(self) -> ResampleRule | None:
+        """Period and methods of the rows that are made of the samples; None: none are made."""
+        if self.resample is None:
+            return None
+        rule = parse_resampling(self.resample, "resample")
+        if rule.period_s is None:
+            raise ValueError(f"resample must state a period, such as 10 s, got {self.resample!r}")
+        return rule
 
     @property
     def training_length(self) -> TrainingLength:

@@ -50,7 +50,8 @@ JUDGING_FORGETTING = 1.0 - 1.0 / MEMORY
 
 def arx_structure(config: MonitorConfig) -> Structure:
     """Structure of the identified models that the settings ask for."""
-    return Structure.of_order(config.order, config.delay, inputs=len(config.inputs))
+    delay = tuple(config.delay[name] for name in config.inputs) if isinstance(config.delay, dict) else config.delay
+    return Structure.of_order(config.order, delay or 1, inputs=len(config.inputs))
 
 
 def simpler_structures(structure: Structure) -> Iterator[Structure]:
@@ -327,7 +328,9 @@ class ArxReference(Reference):
             ValueError: the models are of other settings.
         """
         for predictor in predictors:
-            if predictor.structure not in (self.structure, *simpler_structures(self.structure)):
+            found = predictor.structure
+            as_set = found if self.config.delay is not None else replace(found, delay=self.structure.delay)
+            if as_set not in (self.structure, *simpler_structures(self.structure)):
                 raise ValueError(f"the state must be of {self.structure}, got {predictor.structure}")
         self.predictors[:] = map(copy_of, predictors)
         self.judge_by(ArxMemory())
@@ -340,7 +343,7 @@ class ArxReference(Reference):
         Raises:
             ValueError: the memory is of other settings.
         """
-        shape = self.structure.history, len(self.config.signals)
+        shape = self.history, len(self.config.signals)
         if memory.past is not None and memory.past.shape != shape:
             raise ValueError(f"rows before must have shape {shape}, got {memory.past.shape}")
         self._memory, self.obstacles = memory, {}
@@ -348,6 +351,11 @@ class ArxReference(Reference):
         self._ranges = list(enumerate(zip(memory.low, memory.high, strict=True))) if self._uses_inputs.any() else []
         if memory.past is not None:
             self._set_matrices(*shape)
+
+    @property
+    def history(self) -> int:
+        """Number of rows before a row that the models need."""
+        return max(predictor.structure.history for predictor in self.predictors)
 
     def copy(self) -> "ArxReference":
         """Models that stand where these do, and judge nothing."""

@@ -15,8 +15,10 @@ from reactorwatch.arrays import Array
 from reactorwatch.contract.messages_pb2 import Check, ModelSnapshot, Parameter
 from reactorwatch.errors import InputError
 from reactorwatch.identification.checks import ResidualTest, check_record, independence, whiteness
-from reactorwatch.identification.data import Rows, rows_of
+from reactorwatch.identification.data import Dataset, Rows, rows_of
+from reactorwatch.identification.dead_time import better_structure
 from reactorwatch.identification.identify import WORST_MINUS_LOG10_P
+from reactorwatch.identification.linear import fit_linear
 from reactorwatch.identification.linear_model import standard_deviations
 from reactorwatch.identification.structure import Structure
 from reactorwatch.spc.charts.parameters import learn
@@ -58,7 +60,7 @@ def fit_models(models: ArxReference, rows: RowArrays) -> Array:
 def _fit_model(models: ArxReference, index: int, rows: RowArrays) -> Array:
     """Fit the model of an output; returns its residuals, shape (n,)."""
     model, outputs, residual = models.predictors[index], rows.outputs[:, index], np.full(rows.time_min.size, nan)
-    structure = _fitting_structure(model.structure, rows, outputs)
+    structure = _fitting_structure(_with_dead_times(models, model.structure, rows, outputs), rows, outputs)
     if structure is not None and structure != model.structure:
         model = _learn_again(models, index, structure, rows)
     scaling = model.scaling
@@ -80,6 +82,19 @@ def _fit_model(models: ArxReference, index: int, rows: RowArrays) -> Array:
         snapshot.checks.extend(_check_fit(structure, rows._replace(inputs=inputs, outputs=outputs), residual))
         model.reference_model = snapshot.SerializeToString()
     return residual
+
+
+def _with_dead_times(models: ArxReference, structure: Structure, rows: RowArrays, outputs: Array) -> Structure:
+    """A structure with the dead times that its residuals show, where the settings state none and residuals count."""
+    if models.config.delay is not None or models.config.has_values_only or not structure.inputs:
+        return structure
+    data = Dataset(rows.time_min, rows.inputs, outputs[:, None], models.config.inputs, "output")
+    try:
+        residuals = fit_linear("arx", structure, *data.arrays).residuals(*data.arrays)[:, 0]
+        shown = independence(residuals, data.inputs, structure.delay, time=data.time).minus_log10_p
+    except InputError:  # too few rows, or they do not determine the model
+        return structure
+    return (better_structure(structure, data) if shown >= WORST_MINUS_LOG10_P else None) or structure
 
 
 def _fitting_structure(structure: Structure, rows: RowArrays, outputs: Array) -> Structure | None:
@@ -146,7 +161,7 @@ def start_judging(models: ArxReference, rows: RowArrays) -> None:
         margin = np.maximum(margin, reach - 0.5 * (high - low))
     memory = ArxMemory((low - margin).tolist(), (high + margin).tolist())
     if models.config.has_values_only:
-        history, late = models.structure.history, np.flatnonzero(~regular_intervals(time_min))
+        history, late = models.history, np.flatnonzero(~regular_intervals(time_min))
         newest = np.column_stack([inputs, outputs])[(late[-1] + 1 if late.size else 0) :][: -history - 1 : -1]
         memory.past = np.full((history, newest.shape[1]), nan)
         memory.past[: len(newest)] = newest

@@ -127,23 +127,30 @@ class FileFormat:
     @property
     def resample_rule(self) -> ResampleRule | None:
         """Period and methods of the rows; None: the rows are those of the file."""
-        if self.resample is None:
-            return None
-        period, *others = (part.strip() for part in self.resample.split(","))
-        method, methods = None, dict[str, str]()
-        for part in others:
-            name, is_named, kind = part.rpartition("=")
-            if kind.strip() not in METHODS:
-                raise InputError(describe_unknown("--resample: method", kind.strip(), METHODS))
-            if is_named:
-                methods[name.strip()] = kind.strip()
-            else:
-                method = kind
-        return ResampleRule(None if period == AUTO else _parse_period("--resample", period), method, methods)
+        return None if self.resample is None else parse_resampling(self.resample, "--resample")
 
 
 GUESS = FileFormat()
 """Nothing is stated, all is guessed."""
+
+
+def parse_resampling(text: str, option: str) -> ResampleRule:
+    """Parse a period, or `auto`, with methods behind it.
+
+    Raises:
+        InputError: the period or a method is none; the text begins with the option.
+    """
+    period, *others = (part.strip() for part in text.split(","))
+    method, methods = None, dict[str, str]()
+    for part in others:
+        name, is_named, kind = part.rpartition("=")
+        if kind.strip() not in METHODS:
+            raise InputError(describe_unknown(f"{option}: method", kind.strip(), METHODS))
+        if is_named:
+            methods[name.strip()] = kind.strip()
+        else:
+            method = kind
+    return ResampleRule(None if period == AUTO else _parse_period(option, period), method, methods)
 
 
 def _parse_period(option: str, text: str) -> float:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reactorwatch.arrays import Array
-from reactorwatch.errors import InputError, describe_unknown
+from reactorwatch.errors import InputError, UnfitRecordError, describe_unknown
 from reactorwatch.records.file_format import INTERPOLATED, LAST, MEAN, SECONDS, SPARSE, ResampleRule
 from reactorwatch.records.record import Record, join_runs
 
@@ -24,7 +24,7 @@ LONGEST_HOLD = 5.0
 """A value is held for at most five times the spacing that nine in ten of a signal's values keep: of values at random
 (exponential) spacings one in 100,000 lasts longer, of regular ones five rows. Rows that are further apart are a gap."""
 
-_SLOW = 1.5
+SLOW = 1.5
 """A signal is slower than the period if its median spacing is this many periods: halfway from one to every second
 row."""
 
@@ -42,7 +42,7 @@ _SMALL_MOVES = 0.05
 """Share of moves below half of the median move up to which a signal is reported by exception. A deadband leaves none,
 and normal noise has 26 %: P(|z| < 0.674 / 2)."""
 
-_DIGITS = 6
+DIGITS = 6
 """Decimals of times in periods: stamps are rounded to a digit, and one that is a row's is to be exactly the row's."""
 
 
@@ -54,7 +54,7 @@ class _Series(NamedTuple):
     excluded: NDArray[np.bool_]
 
 
-class _Plan(NamedTuple):
+class SignalPlan(NamedTuple):
     """Resampling of one signal.
 
     Attributes:
@@ -84,7 +84,8 @@ def resample(record: Record, rule: ResampleRule, roles: Mapping[str, str]) -> Re
         The record; `read_as` states period, methods and gaps. Rows in gaps, and those without any value, are left out.
 
     Raises:
-        InputError: the rule names a signal that is not there, no signal has two values, or the period is too short.
+        InputError: the rule names a signal that is not there, no signal has two values or no row one, or the period is
+            too short.
     """
     for name in rule.methods:
         if name not in record.columns:
@@ -98,7 +99,7 @@ def resample(record: Record, rule: ResampleRule, roles: Mapping[str, str]) -> Re
         if rule.period_s is not None
         else find_period_min(record.name, spacings, by_exception)
     )
-    has_faster = any(values.size and np.median(values) <= _SLOW * period_min for values in spacings.values())
+    has_faster = any(values.size and np.median(values) <= SLOW * period_min for values in spacings.values())
     plans = {
         name: _plan(
             rule,
@@ -116,8 +117,11 @@ def resample(record: Record, rule: ResampleRule, roles: Mapping[str, str]) -> Re
     for (run, own), times in zip(runs, stamps, strict=True):
         if times.size:
             rows, found = _find_rows(record.name, times, period_min, gap)
-            resampled.append(_resample_run(run, own, plans, float(times[0]), period_min, rows))
+            made = _resample_run(run, own, plans, float(times[0]), period_min, rows)
+            resampled += [made] if made.rows else []
             gaps += found
+    if not resampled:
+        raise UnfitRecordError(f"{record.name}: --resample: no row has a value; state another period")
     read_as = ", ".join(filter(None, [record.read_as, _state(period_min, reason, plans, gaps)]))
     return replace(join_runs(resampled), read_as=read_as)
 
@@ -165,7 +169,7 @@ def find_period_min(name: str, spacings: Mapping[str, Array], by_exception: set[
     """
     medians = {signal: float(np.median(values)) for signal, values in spacings.items() if values.size}
     if not medians:
-        raise InputError(f"{name}: --resample auto: expected a signal with two values, got none; state a period")
+        raise UnfitRecordError(f"{name}: --resample auto: expected a signal with two values, got none; state a period")
     sampled = {signal: value for signal, value in medians.items() if signal not in by_exception} or medians
     fastest = min(sampled, key=sampled.__getitem__)
     amount, unit = _in_unit(sampled[fastest])
@@ -179,16 +183,18 @@ def _in_unit(minutes: float) -> tuple[float, str]:
     return seconds / SECONDS[unit], unit
 
 
-def _plan(rule: ResampleRule, name: str, role: str, spacing: Array, *, by_exception: bool, has_faster: bool) -> _Plan:
+def _plan(
+    rule: ResampleRule, name: str, role: str, spacing: Array, *, by_exception: bool, has_faster: bool
+) -> SignalPlan:
     """Resampling of a signal from its role and its spacings in periods; `has_faster`: another signal is not slow."""
     median = float(np.median(spacing)) if spacing.size else np.inf
-    is_slow, is_code = median > _SLOW, role in ("mode", "label")
+    is_slow, is_code = median > SLOW, role in ("mode", "label")
     is_sparse = is_slow and has_faster and role == "output"
     of_kind = LAST if by_exception or role == "setpoint" else SPARSE if is_sparse else MEAN
     method = rule.methods.get(name) or (LAST if is_code else rule.method) or of_kind
     lasts = by_exception or (role != "output" and not _is_regular(spacing))
     longest = np.inf if lasts else _longest(spacing)
-    return _Plan(method, role != "output", is_slow, median if spacing.size else 1.0, longest)
+    return SignalPlan(method, role != "output", is_slow, median if spacing.size else 1.0, longest)
 
 
 def _longest(spacing: Array) -> float:
@@ -200,7 +206,7 @@ def _find_rows(name: str, times: Array, period_min: float, gap: float) -> tuple[
     index = (times - times[0]) / period_min
     ends = np.flatnonzero(np.diff(index) > gap)
     edges = [0, *(int(end) + 1 for end in ends), times.size]
-    nearest = np.floor(np.round(index, _DIGITS) + 0.5)
+    nearest = np.floor(np.round(index, DIGITS) + 0.5)
     spans = [(float(nearest[first]), float(nearest[end - 1])) for first, end in pairwise(edges)]
     if sum(last - first + 1 for first, last in spans) > _MOST_ROWS:
         amount, unit = _in_unit(period_min)
@@ -213,7 +219,7 @@ def _find_rows(name: str, times: Array, period_min: float, gap: float) -> tuple[
 def _resample_run(
     run: Record,
     series: Mapping[str, _Series],
-    plans: Mapping[str, _Plan],
+    plans: Mapping[str, SignalPlan],
     start_min: float,
     period_min: float,
     rows: NDArray[np.int64],
@@ -221,11 +227,10 @@ def _resample_run(
     """Rows of one run, without those in which nothing is measured."""
     measured, excluded = dict[str, Array](), dict[str, Array]()
     for name, (times, values, is_excluded) in series.items():
-        index, plan = np.round((times - start_min) / period_min, _DIGITS), plans[name]
-        make = _METHODS[plan.method]
-        measured[name] = make(index, np.where(is_excluded, np.nan, values), rows, plan)
+        index, plan = np.round((times - start_min) / period_min, DIGITS), plans[name]
+        measured[name] = values_in_rows(index, np.where(is_excluded, np.nan, values), rows, plan)
         if name in run.excluded:
-            excluded[name] = make(index, np.where(is_excluded, values, np.nan), rows, plan)
+            excluded[name] = values_in_rows(index, np.where(is_excluded, values, np.nan), rows, plan)
     stay = ~np.all(np.isnan([*measured.values(), *excluded.values()]), axis=0)
     return replace(
         run,
@@ -236,7 +241,7 @@ def _resample_run(
     )
 
 
-def _mean(index: Array, values: Array, rows: NDArray[np.int64], plan: _Plan) -> Array:
+def _mean(index: Array, values: Array, rows: NDArray[np.int64], plan: SignalPlan) -> Array:
     """Mean over the time of each row; see the text of this module."""
     if not index.size:
         return np.full(rows.size, np.nan)
@@ -262,21 +267,21 @@ def _mean(index: Array, values: Array, rows: NDArray[np.int64], plan: _Plan) -> 
     return np.where(has_mean, sums / np.where(has_mean, known, 1.0), np.nan)
 
 
-def _last(index: Array, values: Array, rows: NDArray[np.int64], plan: _Plan) -> Array:
+def _last(index: Array, values: Array, rows: NDArray[np.int64], plan: SignalPlan) -> Array:
     """Last value up to each row."""
     at = np.searchsorted(index, rows, side="right") - 1
     age = rows - np.concatenate([index, [-np.inf]])[at]
     return np.where(age <= plan.longest, np.concatenate([values, [np.nan]])[at], np.nan)
 
 
-def _sparse(index: Array, values: Array, rows: NDArray[np.int64], _plan: _Plan) -> Array:
+def _sparse(index: Array, values: Array, rows: NDArray[np.int64], _plan: SignalPlan) -> Array:
     """Each value in its nearest row, the last one where there are several."""
     at = np.searchsorted(index, rows + 0.5, side="left") - 1
     age = rows - np.concatenate([index, [-np.inf]])[at]
     return np.where(age <= 0.5, np.concatenate([values, [np.nan]])[at], np.nan)
 
 
-def _interpolate(index: Array, values: Array, rows: NDArray[np.int64], plan: _Plan) -> Array:
+def _interpolate(index: Array, values: Array, rows: NDArray[np.int64], plan: SignalPlan) -> Array:
     """The line between the values before and after each row."""
     if not index.size:
         return np.full(rows.size, np.nan)
@@ -288,7 +293,22 @@ def _interpolate(index: Array, values: Array, rows: NDArray[np.int64], plan: _Pl
 _METHODS = {MEAN: _mean, LAST: _last, SPARSE: _sparse, INTERPOLATED: _interpolate}
 
 
-def _state(period_min: float, reason: str, plans: Mapping[str, _Plan], gaps: int) -> str:
+def values_in_rows(index: Array, values: Array, rows: NDArray[np.int64], plan: SignalPlan) -> Array:
+    """Values of a signal in rows of one period.
+
+    Args:
+        index: times of its values in periods after row 0, increasing, shape (values,).
+        values: the values, shape (values,); NaN: no measurement.
+        rows: numbers of the rows, increasing, shape (rows,).
+        plan: resampling of the signal.
+
+    Returns:
+        Shape (rows,); NaN where it has none.
+    """
+    return _METHODS[plan.method](index, values, rows, plan)
+
+
+def _state(period_min: float, reason: str, plans: Mapping[str, SignalPlan], gaps: int) -> str:
     """Statement for people: period, methods and gaps; of many signals of one method their number."""
     amount, unit = _in_unit(period_min)
     groups: dict[str, list[str]] = {}

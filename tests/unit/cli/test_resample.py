@@ -65,10 +65,12 @@ def test_an_export_by_exception_is_watched_resampled_and_the_cure_is_named_witho
 ) -> None:
     refused = called("backtest", export, *SIGNALS)
     assert refused.returncode == 3
-    assert "; --resample auto makes them regular" in refused.stdout
-    watched = called("backtest", export, *SIGNALS, "--resample", "10 s")
+    assert "; --resample auto, or resample in [monitor], makes them regular" in refused.stdout
+    watched = called("backtest", export, *SIGNALS, "--resample", "10 s,y=interpolated")
     assert watched.returncode == 0
-    assert "resampled to 10 s: u mean (held between), y mean" in watched.stderr
+    assert "resampled to 10 s: u mean (held between), y interpolated" in watched.stderr
+    assert "no alarms" in watched.stdout
+    assert "not trustworthy" not in watched.stdout
 
 
 def test_a_recording_is_resampled_as_the_table_that_it_was_made_of(
@@ -89,6 +91,24 @@ def test_a_recording_is_resampled_as_the_table_that_it_was_made_of(
         refused = called(command, recording, "--resample", "10 s")
         assert refused.returncode == 2
         assert "export it with --resample" in refused.stderr
+
+
+def test_a_monitor_makes_the_rows_itself_of_a_table_and_of_its_recording(
+    export: Path, tmp_path: Path, called: Command
+) -> None:
+    """As on the bus: both are samples, and the rows are made of their times alone."""
+    recording, settings, rows = tmp_path / "export.mcap", tmp_path / "rig.toml", tmp_path / "rows.csv"
+    import_csv(export, recording, "rig", choice=CHOICE)
+    settings.write_text('[monitor]\nresample = "10 s"\n')
+    results = []
+    for file in (export, recording):
+        text = called("backtest", file, *SIGNALS, "--config", settings, "--rows", rows, "--force", "--json").stdout
+        result = json.loads(text)
+        assert result["watched"]
+        assert result["trained_until_min"] == pytest.approx(1000 / 6, abs=2.0)
+        results.append({name: value for name, value in result.items() if name not in ("file", "plant")})
+        assert len(rows.read_text().splitlines()) == pytest.approx(result["span_min"] * 6, abs=10)
+    assert results[0] == results[1]
 
 
 def test_files_in_a_row_are_joined_before_they_are_resampled(export: Path, tmp_path: Path) -> None:
