@@ -57,13 +57,13 @@ class DefaultCharts(tuple[str, ...]):
     __slots__ = ()
 
 
-USUAL_CHARTS = DefaultCharts(("shewhart", "ewma", "mewma"))
+USUAL_CHARTS = DefaultCharts(("shewhart", "ewma", "mewma", "level"))
 """Charts where the settings name none."""
 
-CHARTS_OF_MANY = DefaultCharts(("residual_space",))
+CHARTS_OF_MANY = DefaultCharts(("residual_space", "level"))
 """Charts where the settings name none, of many outputs that no equations judge."""
 
-CHARTS_OF_DOZENS = DefaultCharts(("residual_space", "cva_residual"))
+CHARTS_OF_DOZENS = DefaultCharts(("residual_space", "cva_residual", "level"))
 """Charts where the settings name none, of `DOZENS` outputs or more that no equations judge."""
 
 DOZENS = 20
@@ -135,7 +135,8 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
         process: process of the plant: a name in the catalogue, or a .toml, .py or extended.json file; None: the
             nominal reactor where its signals are watched; empty: no equations judge.
         charts: charts of the residuals and of the values; where none are named, `residual_space` for 8 outputs or more
-            that no equations judge, with `cva_residual` from 20 on, else `shewhart`, `ewma` and `mewma`.
+            that no equations judge, with `cva_residual` from 20 on, else `shewhart`, `ewma` and `mewma`; beside them
+            `level`.
         false_alarms_per_30_days: number of false alarms in 30 days of the plant, over all alarms; None: 1, or 1
             in 8,640 rows if rows are slower than 5 min; the fewest that the charts can keep if that is more.
         smallest_sd: least standard deviation of the residual by output, in its unit; smaller deviations do not matter.
