@@ -11,6 +11,7 @@ not computed again.
 
 import contextlib
 import hashlib
+import importlib.util
 import io
 import json
 import subprocess
@@ -19,6 +20,7 @@ import tomllib
 import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from platformdirs import user_cache_path
@@ -43,9 +45,6 @@ Stretch = tuple[Mapping[str, float], Array]
 
 def simulate_tanks(stretches: Sequence[Stretch], noise: Array) -> Array:
     """Levels by pcgym."""
-    python = PCGYM / "bin" / "python"
-    if not python.exists():
-        raise InputError("pcgym is not installed; run `python -m benchmarks.inexact.foreign`, which installs it apart")
     named = [
         {
             "constants": {name.replace("gamma", "gamma_"): value for name, value in constants.items()},
@@ -56,7 +55,7 @@ def simulate_tanks(stretches: Sequence[Stretch], noise: Array) -> Array:
     job = json.dumps({"start": [0.2] * 4, "period_s": PLANTS["four_tanks"]["period_s"], "stretches": named})
     file = PCGYM / f"{hashlib.sha256(job.encode()).hexdigest()[:16]}.json"
     if not file.exists():
-        command = [python, FOLDER / "pcgym_run.py"]
+        command = [PCGYM / "bin" / "python", FOLDER / "pcgym_run.py"]
         done = subprocess.run(command, input=job, capture_output=True, text=True, check=True)
         file.write_text(done.stdout.splitlines()[-1], encoding="utf-8")
     return np.asarray(json.loads(file.read_text(encoding="utf-8")) + noise)
@@ -120,11 +119,42 @@ SIMULATORS = {"four_tanks": simulate_tanks, "tclab_simulator": simulate_tclab, "
 """Functions of constants and inputs by row, and of what is added to the outputs, that return what is measured."""
 
 
-def draw(seed: int, number: int, sound: bool) -> Drawn:
-    """Draw a record: the plants take turns, then the causes of each."""
+PACKAGE_OF = {"tclab_simulator": "tclab", "van_de_vusse": "do_mpc"}
+
+
+def missing_of(name: str) -> str:
+    """Instruction to install what the simulator of a plant needs; empty if it is installed."""
+    if name == "four_tanks":
+        installed = (PCGYM / "bin" / "python").exists()
+        cure = "pcgym is not installed; run `python -m benchmarks.inexact.foreign`, which installs it apart"
+    else:
+        installed = importlib.util.find_spec(PACKAGE_OF[name]) is not None
+        cure = f"{PACKAGE_OF[name]} is not installed; run `pip install --group peers`"
+    return "" if installed else f"{name}: {cure}"
+
+
+class Span(NamedTuple):
+    """Length of a record, and its cause."""
+
+    rows: int = ROWS  # rows of the record
+    onset_rows: tuple[float, float] = (0.3 * ROWS, 0.7 * ROWS)  # earliest and latest row of the onset
+    is_medium: bool = False  # true if causes have the middle of their sizes
+
+
+USUAL = Span()
+
+
+def draw(seed: int, number: int, sound: bool, span: Span = USUAL) -> Drawn:
+    """Draw a record: the plants take turns, then the causes of each.
+
+    Raises:
+        InputError: the plant's simulator is not installed.
+    """
     turn, index = divmod(number, len(PLANTS))
     name, plant = list(PLANTS.items())[index]
-    rng, rows = np.random.default_rng([seed, 5, int(sound), number]), SETTLING_ROWS + ROWS
+    if missing := missing_of(name):
+        raise InputError(missing)
+    rng, rows = np.random.default_rng([seed, 5, int(sound), number]), SETTLING_ROWS + span.rows
     hold = (LONGEST_HOLD_ROWS / 3, LONGEST_HOLD_ROWS)
     moves = [draw_moves(rng, rows, hold, levels, 1.0) for levels in plant["inputs"].values()]
     inputs = np.stack([level_at(item, np.arange(rows, dtype=np.float64)) for item in moves], axis=1)
@@ -132,10 +162,12 @@ def draw(seed: int, number: int, sound: bool) -> Drawn:
     inputs = inputs + WANDER * spans * _wander(rng, inputs.shape)
     is_unseen = turn % 2 == 1
     actual = inputs + (WANDER_UNSEEN * spans * _wander(rng, inputs.shape) if is_unseen else 0.0)
-    onset = SETTLING_ROWS + int(rng.uniform(0.3, 0.7) * ROWS)
+    onset = SETTLING_ROWS + int(rng.uniform(*span.onset_rows))
     causes, constants = plant["causes"], plant["constants"]
     order = np.random.default_rng([seed, 6, index, turn // len(causes)]).permutation(len(causes))
     names, least, most = causes[int(order[turn % len(causes)])]
+    if span.is_medium:
+        least = most = 0.5 * (least + most)
     size = 0.0 if sound else float(rng.choice((-1.0, 1.0)) * rng.uniform(least, most))
     off = str(rng.choice([item for item in constants if f"{item}.deviation" not in names]))
     factor = float(rng.choice((1.0 - STEP_OFF, 1.0 + STEP_OFF)))
@@ -148,11 +180,8 @@ def draw(seed: int, number: int, sound: bool) -> Drawn:
         actual[onset:, list(plant["inputs"]).index(place)] *= 1.0 + size
     else:
         after[place] += size if place == "Ta" else size * before[place]
-    try:
-        measured = SIMULATORS[name]([(before, actual[:onset]), (after, actual[onset:])], noise)
-    except ModuleNotFoundError as error:
-        raise InputError(f"{name} needs {error.name}; run `pip install --group peers`") from error
-    columns = {"time_s": plant["period_s"] * np.arange(ROWS, dtype=np.float64)}
+    measured = SIMULATORS[name]([(before, actual[:onset]), (after, actual[onset:])], noise)
+    columns = {"time_s": plant["period_s"] * np.arange(span.rows, dtype=np.float64)}
     columns |= dict(zip(plant["inputs"], inputs[SETTLING_ROWS:].T, strict=True))
     columns |= dict(zip(plant["noise"], measured[SETTLING_ROWS:].T, strict=True))
     period_min = plant["period_s"] / 60.0

@@ -62,7 +62,7 @@ class NeuralModel:
         weights, constant = (theta[:-1], theta[-1]) if structure.offset else (theta, 0.0)
         spread = scaling.output_spreads[0]
         own, run = y[:, 0].copy(), np.full(y.shape, np.nan)
-        first = structure.delay - 1
+        first = structure.delays[0] - 1
         for k in np.flatnonzero(plan.running):
             if plan.starts[k]:
                 own[k - structure.history : k] = y[k - structure.history : k, 0]

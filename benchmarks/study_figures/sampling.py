@@ -199,7 +199,7 @@ def report_choice(record: Record) -> tuple[float, float, str, bool]:
     except InputError as refusal:
         said = f"refused: {str(refusal).partition(':')[0]}"
     rows = np.arange(SKIP, u.size, EVERY)
-    lags = [u[rows - lag] for lag in range(_STRUCTURE.delay, _STRUCTURE.delay + _STRUCTURE.input_lags)]
+    lags = [u[rows - lag] for lag in range(_STRUCTURE.delays[0], _STRUCTURE.delays[0] + _STRUCTURE.input_lags)]
     blind = any(np.array_equal(one, other) for one, other in combinations(lags, 2))
     return _condition(all_rows), _condition(chosen), said, blind
 

@@ -1,10 +1,13 @@
-"""Slow deviations: lasting steps of measurements, and drift of the adaptive models from the references.
+"""Slow deviations: lasting steps of measurements, changes in an incident, drift of the models from the references.
 
 Where a reference predicts an output from its last values, as the ARX models and the black box do, a lasting step is in
 the residual for a few rows only. The test (`reactorwatch.spc.step_test`) finds it by the form of these rows and tells
 it from an outlier. The equations follow no measurement against their balances: with them there is no such test, and no
 share of the promised false alarms. Rows in which the reference extrapolates are tested all the same: a step in them
 would not be seen afterwards, as the reference follows it, or learns it.
+
+Where nothing moves the plant but itself, as there are no inputs, a change of its level while an alarm is active is an
+event of its own: it returns, or goes on to another state (`reactorwatch.spc.level_change`).
 
 Drift is published every few minutes. By default it raises no alarm: a plant that is run where it was not run in
 training drifts from its linear model without anything being wrong. With `parameters` among the charts it raises one,
@@ -17,8 +20,9 @@ from math import isfinite, nan
 
 import numpy as np
 
-from monitor_node.alarms.alarms import AlarmChange
+from monitor_node.alarms.alarms import AlarmChange, ChartAlarm
 from monitor_node.alarms.annunciator import Annunciator
+from monitor_node.charts.chart_design import ALL
 from monitor_node.charts.charts import chart_point
 from monitor_node.config import MonitorConfig
 from monitor_node.ingest.alignment import MeasuredRow
@@ -30,6 +34,7 @@ from reactorwatch.contract.codec import Publication
 from reactorwatch.errors import InputError
 from reactorwatch.spc.charts.base import Judgement, format_quantity
 from reactorwatch.spc.charts.parameters import ParameterT2, adaptive_weight, prepare_limit
+from reactorwatch.spc.level_change import LevelChange
 from reactorwatch.spc.prewhitening import Prewhitening
 from reactorwatch.spc.step_test import ONSETS, STEP_TEST, StepTests
 from reactorwatch.stored_state import Records, place_records
@@ -116,6 +121,66 @@ class ShiftWatch:
             change.contributions = {name: 1.0}
             changes.append(change)
         return changes
+
+
+CHANGE = "change"
+"""Name of the chart of changes within an incident."""
+
+
+class ChangeWatch:
+    """Tests a plant without inputs for changes of level while an alarm without a known cause is active.
+
+    Attributes:
+        memory: the test; None with inputs, and before the end of the training.
+    """
+
+    def __init__(self, config: MonitorConfig, board: Annunciator) -> None:
+        self._outputs, self._rows = config.outputs, config.clear_count  # what ends an alarm lasts
+        self._alarm: ChartAlarm | None = None
+        if not config.inputs:
+            # a change in an incident belongs to it, and says nothing of its cause
+            self._alarm = board.declare(CHANGE, ALL, without_on_delay=True, without_off_delay=True, is_transient=True)
+        self._key = keys.key(config.plant, keys.CHART, keys.chart_name(CHANGE, ALL))
+        self.memory: LevelChange | None = None
+
+    def start(self, values: Array) -> None:
+        """Learn from the outputs of a training, shape (rows, outputs); NaN where missing or disturbed."""
+        self.memory = None if self._alarm is None else LevelChange.learn(values, self._rows)
+
+    def restart(self) -> None:
+        """Forget the rows seen, after a gap."""
+        if self.memory is not None:
+            self.memory.restart()
+
+    def end_incident(self) -> None:
+        """Wait for the next incident."""
+        if self.memory is not None:
+            self.memory.start()
+
+    def update(self, row: MeasuredRow, *, points: bool) -> list[AlarmChange]:
+        """Test a row of an incident; returns the change of the alarm."""
+        test, alarm = self.memory, self._alarm
+        if test is None or alarm is None:
+            return []
+        changes = test.update(list(row.values))
+        if len(test.recent) < 2 * test.rows:
+            return []
+        shares = [abs(change) / limit for change, limit in zip(changes, test.limits, strict=True)]
+        largest = max(shares)
+        is_out = largest > 1.0
+        test.is_settled |= not is_out
+        judgement = Judgement(largest, 0.0, 0.0, 1.0, is_out and test.is_settled)
+        if points:
+            row.publications.append(Publication(self._key, chart_point(row.time_ns, judgement)))
+        if (found := alarm.update(judgement)) is None:
+            return []
+        order = sorted(range(len(shares)), key=lambda i: -shares[i])
+        total = sum(share * share for share in shares) or 1.0
+        found.contributions = {self._outputs[i]: shares[i] ** 2 / total for i in order}
+        first = order[0]
+        moved = format_quantity(changes[first], row.units[first], "+.3g")
+        found.text = f"the plant moves again: {self._outputs[first]} by {moved} within {test.rows} rows"
+        return [found]
 
 
 ROWS = 50

@@ -94,8 +94,11 @@ class LaggedRows(Memory, dict=True):
         structure, self._history = self.structure, self.structure.history
         if len(self.inputs) != len(self.outputs) * structure.inputs or len(self.outputs) > self._history:
             raise ValueError(f"there must be at most {self._history} equal rows, got {len(self.outputs)}")
-        first = structure.delay - 1
-        self._lags = slice(first * structure.inputs, (first + structure.input_lags) * structure.inputs)
+        self._lags = [
+            (delay - 1 + lag) * structure.inputs + i
+            for lag in range(structure.input_lags)
+            for i, delay in enumerate(structure.delays)
+        ]
 
     def restart(self) -> None:
         """Forget the rows, as after a gap."""
@@ -111,7 +114,7 @@ class LaggedRows(Memory, dict=True):
             return None
         regressor, before = None, self._history - 1
         if len(self.outputs) > before:
-            values = self.outputs[: self.structure.output_lags] + self.inputs[self._lags]
+            values = self.outputs[: self.structure.output_lags] + [self.inputs[i] for i in self._lags]
             regressor = np.array([*values, 1.0] if self.structure.offset else values)
         self.outputs = [output, *self.outputs[:before]]
         self.inputs = inputs + self.inputs[: before * self.structure.inputs]
@@ -428,8 +431,8 @@ class ArxReference(Reference):
             theta[i, :lags, inputs + i], self._offsets[i] = parameters[:lags], parameters[-1]
             needed[i, : structure.history, inputs + i] = 1.0
             if structure.inputs:
-                moved = slice(structure.delay - 1, structure.delay - 1 + structure.input_lags)
-                theta[i, moved, :inputs] = parameters[lags:-1].reshape(structure.input_lags, inputs)
+                for lag, coefficients in enumerate(parameters[lags:-1].reshape(structure.input_lags, inputs)):
+                    theta[i, np.array(structure.delays) - 1 + lag, np.arange(inputs)] = coefficients
                 needed[i, : structure.history, :inputs] = 1.0
         self._theta, self._needed = theta.reshape(outputs, -1), needed.reshape(outputs, -1)
 

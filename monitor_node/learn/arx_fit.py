@@ -190,7 +190,7 @@ def _snapshot(
     return ModelSnapshot(
         structure=ArxReference.kind,
         order=structure.output_lags,
-        delay=structure.delay,
+        delay=min(structure.delays, default=1),
         parameters=[Parameter(name=name, value=value, sd=sd) for name, value, sd in named],
         rows=rows,
         forgetting=forgetting,

@@ -14,7 +14,7 @@ from monitor_node.causes.stage import Suspicion, SuspicionMemory, has_causes
 from monitor_node.charts.chart_design import count_chance_alarms
 from monitor_node.charts.charts import ChartsMemory, ChartWatch
 from monitor_node.charts.shift_and_drift import NAME as SHIFT
-from monitor_node.charts.shift_and_drift import DriftWatch, ShiftWatch
+from monitor_node.charts.shift_and_drift import ChangeWatch, DriftWatch, ShiftWatch
 from monitor_node.checks.base import CheckTraining
 from monitor_node.checks.signal_checks import SignalChecks
 from monitor_node.config import MonitorConfig
@@ -40,6 +40,7 @@ from reactorwatch.records.record import MINUTE_NS
 from reactorwatch.spc import false_alarm_budget
 from reactorwatch.spc.charts.parameters import ParameterT2
 from reactorwatch.spc.false_alarm_budget import TrainingErrors
+from reactorwatch.spc.level_change import LevelChange
 from reactorwatch.spc.prewhitening import Prewhitener, Prewhitening
 from reactorwatch.stored_state import Memory, Records, place_records
 
@@ -57,6 +58,7 @@ class EvaluationMemory(Memory, kw_only=True):
         left_out: signals that are not monitored, with the reason.
         charts: memory of the charts.
         shift: tests for lasting steps, one an output, see `STEP_TEST`; None without them.
+        level_change: test for changes within an incident; None without it.
         suspicion: memory of the search for causes; None if there is none.
         promise: the promise of false alarms.
         arl0: in-control run length of each alarm, in rows; 0 before the end of the training.
@@ -76,6 +78,7 @@ class EvaluationMemory(Memory, kw_only=True):
     left_out: dict[str, str] = msgspec.field(default_factory=dict)
     charts: ChartsMemory = msgspec.field(default_factory=ChartsMemory)
     shift: Records | None = None
+    level_change: LevelChange | None = None
     suspicion: SuspicionMemory | None = None
     promise: PlantPromise | None = None
     arl0: float = 0.0
@@ -110,6 +113,7 @@ class Evaluation:
         self._use_ranges()
         self.drift = DriftWatch(config, board, publish=models.points)
         self.shift = ShiftWatch(config, board)
+        self.change = ChangeWatch(config, board)
         self.suspicion: Suspicion | None = None
         self.whitener_numbers = self.ordinary.numbers["whiteners"][0]
         self.whiteners = [Prewhitener(None, self.whitener_numbers[i : i + 1]) for i in range(len(config.outputs))]
@@ -159,7 +163,7 @@ class Evaluation:
         self._set_reference(memory.reference.reference(equations, outputs, self.models), learned, memory.suspicion)
         self.charts.resume(memory.charts, self.evaluated)
         self.shift.resume(memory.shift)
-        memory.shift = self.shift.memory
+        memory.shift, self.change.memory = self.shift.memory, memory.level_change
 
     def _new_memory(self) -> EvaluationMemory:
         return EvaluationMemory(
@@ -188,7 +192,8 @@ class Evaluation:
             whitener.start(item)
         self.charts.start(trained.learned, trained.e, trained.values, arl0)
         self.shift.start(trained.responses if self.shift.is_active else None, trained.z, trained.learned, arl0)
-        memory.charts, memory.shift = self.charts.memory, self.shift.memory
+        self.change.start(trained.values[:, len(self._config.inputs) :])
+        memory.charts, memory.shift, memory.level_change = self.charts.memory, self.shift.memory, self.change.memory
         values, e = trained.measured.T.tolist(), trained.e.T.tolist()
         self.signals.start(CheckTraining(values, e, trained.outliers, period_ns, arl0))
         rates, mean_rate = self._alarm_rates(trained, arl0), self.chance_alarms / arl0
@@ -259,6 +264,7 @@ class Evaluation:
         for whitener in self.whiteners:
             whitener.restart()
         self.shift.restart()
+        self.change.restart()
         self.signals.on_gap()
 
     def restart_charts(self) -> None:

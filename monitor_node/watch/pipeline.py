@@ -295,6 +295,8 @@ class PlantPipeline:
         changes += charts.update(row, e, quarantined, scales, points=self._points)
         if shift.is_active:
             changes += shift.update(row, tested, points=self._points)
+        if self._board.has_unexplained:
+            changes += evaluation.change.update(row, points=self._points)
         self._end_row(row, changes, before, stuck)
         for about, text in reference.obstacles.items():
             if about not in self._noted:
@@ -336,6 +338,7 @@ class PlantPipeline:
             reference.set_learning(not board.has_unexplained)
             if not board.has_unexplained:
                 memory.incident = None
+                evaluation.change.end_incident()
             else:
                 if memory.incident is None:
                     memory.incident = TrainingRows([0] * len(self._config.outputs))

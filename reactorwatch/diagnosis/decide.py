@@ -4,11 +4,13 @@
 |---|---|---|
 | no explanation is better than the simulation as it is by `LEAST_GAIN` | nominal | right |
 | only unmodelled sources explain it, or a place explains it better than the catalogue | unknown | see below |
-| a law explains it, and no cause with an onset removes 95 % with nuisance | unknown | see below |
+| a law explains it, and no cause with an onset removes 95 % with nuisance, or it leaves more than the law and the \
+tolerance | unknown | see below |
 | with nuisance, what is left without a cause is within the tolerance, and the best cause is better than none by less \
 than `LEAST_GAIN`, is there from the beginning, changes the outputs by less than half of the tolerance or removes less \
 than 0.8 | nominal | right |
-| the best cause with nuisance removes at least 0.8 | named, or ambiguous | explained or mostly |
+| the best cause with nuisance removes at least 0.8, or half and leaves no more than the tolerance | named, or \
+ambiguous | explained or mostly |
 | otherwise, without nuisance | named, or ambiguous with a rival within `SURE` | explained or mostly |
 
 Grades of a cause: *explained* if it removes 95 % of the squared error or leaves no more than the tolerance, *mostly* if
@@ -48,8 +50,9 @@ EXPLAINS, MOST, SOME = 0.95, 0.5, 0.1
 
 SMALL_EFFECT, LARGE_SHARE = 0.5, 0.8
 """A record within the tolerance without any cause is right, unless a cause changes the outputs by the first of these,
-in tolerances, and removes the second of the error. A cause that is named with nuisance removes at least that: where the
-right one was left out of the catalogue, another one removed 0.62 and left twenty times the tolerance."""
+in tolerances, and removes the second of the error. A cause that is named with nuisance removes at least that, or half
+and leaves no more than the tolerance: where the right one was left out of the catalogue, another one removed 0.62 and
+left twenty times the tolerance."""
 
 
 class Found(NamedTuple):
@@ -105,6 +108,11 @@ class Graded(NamedTuple):
     left: float
     effect: float
     profile: str
+
+    @property
+    def is_cause(self) -> bool:
+        """True if it explains enough to be named."""
+        return self.share >= LARGE_SHARE or (self.share >= MOST and self.left <= 1.0)
 
 
 class Verdict(NamedTuple):
@@ -170,12 +178,12 @@ def decide(
     best = graded[0]
     is_small = best.profile == CONSTANT.name or best.effect < SMALL_EFFECT or best.share < LARGE_SHARE
     is_small = is_small or best.lead < LEAST_GAIN
-    if is_law and (best.share < EXPLAINS or best.profile in (CONSTANT.name, FREE_NAME)):
+    if is_law and (best.share < EXPLAINS or best.profile in (CONSTANT.name, FREE_NAME) or best.left > max(left, 1.0)):
         return Verdict(verdict, grade_of(verdict, max(item.share for item in graded), left))
     if is_small and none.left <= 1.0:
         return Verdict(NOMINAL, RIGHT, with_nuisance=True)
-    if best.share >= LARGE_SHARE and best.lead >= LEAST_GAIN:
-        rivals = [item for item in graded[1:] if best.lead - item.lead < LISTED and item.share >= LARGE_SHARE]
+    if best.is_cause and best.lead >= LEAST_GAIN:
+        rivals = [item for item in graded[1:] if best.lead - item.lead < LISTED and item.is_cause]
         named = AMBIGUOUS if rivals else NAMED
         return Verdict(named, grade_of(named, best.share, best.left), with_nuisance=True)
     if verdict != UNKNOWN and share >= MOST:

@@ -12,7 +12,6 @@ from reactorwatch.diagnosis.experiment.inputs import check_limits
 from reactorwatch.diagnosis.graded import with_nuisance
 from reactorwatch.diagnosis.inexact.explain import explain
 from reactorwatch.diagnosis.inexact.nuisance import time_sd_min
-from reactorwatch.diagnosis.parameter_priors import check_priors
 from reactorwatch.diagnosis.practical_significance import tolerances_of
 from reactorwatch.diagnosis.problem import Problem
 from reactorwatch.diagnosis.record_checks import (
@@ -27,7 +26,7 @@ from reactorwatch.diagnosis.search.screen import Part
 from reactorwatch.diagnosis.search.search import smallest_noise
 from reactorwatch.diagnosis.whiteness import DOUBTFUL
 from reactorwatch.process import effects_of
-from reactorwatch.process.effect import Effect
+from reactorwatch.process.effect import TIMING, Effect
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.process.profiles import CONSTANT, FREE_NAME
 from reactorwatch.process.signal_effects import InputDelay, InputLag, OutputDelay, OutputLag
@@ -67,7 +66,6 @@ def diagnose(
     run = make_run(record, model)
     tolerances = tolerances_of(run, model, tolerance or {})
     stated = uncertain or {}
-    check_priors(model, stated)
     catalogue = tuple(effects_of(model) if effects is None else effects)
     smallest_sd = smallest_noise(model, run.measured)
     problem = Problem(record, run, model, catalogue, stated, tolerances, limits or {}, smallest_sd)
@@ -88,6 +86,8 @@ def diagnose(
 
 def _calls_for_nuisance(diagnosis: Diagnosis, exact: Exact, model: ProcessModel) -> bool:
     """True if the hypotheses are to be compared with nuisance: nothing simple explains the record to the noise."""
+    if diagnosis.location == TIMING:
+        return False  # an integrator's steps are named, and nuisance would imitate them
     best, is_white = exact.best, all(item.minus_log10_p < DOUBTFUL for item in diagnosis.adequacy.values())
     if diagnosis.verdict == UNKNOWN:
         return diagnosis.practical or diagnosis.law is None or not is_white

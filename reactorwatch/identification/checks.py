@@ -33,7 +33,7 @@ from reactorwatch.errors import InputError, UnfitRecordError
 from reactorwatch.identification.data import RunPlan, ScaledRecord, consecutive_rows
 from reactorwatch.identification.linear import instrumental_variable
 from reactorwatch.identification.linear_model import simulate
-from reactorwatch.identification.structure import Structure, as_columns
+from reactorwatch.identification.structure import Delay, Structure, as_columns
 
 LARGEST_CONDITION = 1e4  # of the scaled regressors: four digits are lost
 SLOWEST_SAMPLES, BEST_SAMPLES, FASTEST_SAMPLES = 3.0, 10.0, 30.0  # T95: about twice beyond what is advised is accepted
@@ -220,7 +220,7 @@ def response_samples(structure: Structure, parameters: NDArray[np.float64]) -> f
         theta[-1] = 0.0
     response = simulate(structure, theta, step, np.zeros((length, 1)), plan)[structure.history :, 0]
     reached = np.flatnonzero(response / final >= 0.95)
-    return float(reached[0] - structure.delay + 1) if reached.size else math.nan
+    return float(reached[0] - structure.delays[strongest] + 1) if reached.size else math.nan
 
 
 def amplitude(record: ScaledRecord) -> Check:
@@ -293,7 +293,7 @@ def whiteness(residuals: ArrayLike, lags: int = DEFAULT_LAGS, fitted: int = 0) -
 def independence(
     residuals: ArrayLike,
     inputs: ArrayLike,
-    delay: int = 1,
+    delay: Delay = 1,
     lags: int = DEFAULT_LAGS,
     time: ArrayLike | None = None,
 ) -> ResidualTest:
@@ -302,26 +302,27 @@ def independence(
     Args:
         residuals: shape (rows,), NaN where there is none.
         inputs: shape (rows,) or (rows, inputs).
-        delay: the first lag of the inputs that is tested.
+        delay: the first lag that is tested, of all inputs or of each.
         lags: number of lags of each input.
         time: shape (rows,); None: gaps are not detected.
 
     Raises:
         InputError: fewer than two residuals a lag, or a delay or number of lags below 1.
     """
-    if delay < 1 or lags < 1:
+    delays = np.array(delay, dtype=np.int64)
+    if delays.min() < 1 or lags < 1:
         raise InputError(f"delay and lags must be at least 1, got {delay} and {lags}")
     values, present = _centre(residuals, lags)
     u = as_columns(inputs, "inputs")
     if len(u) != values.size:
         raise InputError(f"residuals and inputs must have equally many rows, got {values.size} and {len(u)}")
-    reach = delay + lags - 1
+    reach = int(delays.max()) + lags - 1
     rows = np.flatnonzero(present & (np.concatenate([[0], consecutive_rows(u, time)[:-1]]) >= reach))
     if rows.size <= reach:
         raise UnfitRecordError(
             f"{lags} lags need more than {reach} rows with a residual and past inputs, got {rows.size}"
         )
-    past = np.concatenate([u[rows - lag] for lag in range(delay, delay + lags)], axis=1)
+    past = np.concatenate([u[rows[:, None] - delays - lag, np.arange(u.shape[1])] for lag in range(lags)], axis=1)
     past = past - past.mean(axis=0)
     # A constant or duplicate input adds no direction; the projection counts independent ones.
     directions, sizes, _ = np.linalg.svd(past, full_matrices=False)

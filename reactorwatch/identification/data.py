@@ -181,7 +181,8 @@ def rows_of(
         raise InputError(f"inputs and outputs must have equally many rows, got {len(u)} and {len(y)}")
     position = np.flatnonzero(consecutive_rows(np.concatenate([u, y], axis=1), time) > structure.history)
     columns = [y[position - lag] for lag in range(1, structure.output_lags + 1)]
-    columns += [u[position - structure.delay - lag] for lag in range(structure.input_lags)]
+    delays, inputs = np.array(structure.delays, dtype=np.int64), np.arange(structure.inputs)
+    columns += [u[position[:, None] - delays - lag, inputs] for lag in range(structure.input_lags)]
     if structure.offset:
         columns.append(np.ones((position.size, 1)))
     return Rows(np.concatenate(columns, axis=1), y[position], position)

@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.numba_kernel import jit
 from reactorwatch.identification.data import PlanArrays, RunPlan, plan_run, rows_of
-from reactorwatch.identification.structure import Structure, as_columns
+from reactorwatch.identification.structure import Orders, Structure, as_columns
 
 Kind = Literal["arx", "oe", "armax", "bj"]
 """Kind of a model; `oe` is output error, `bj` is Box-Jenkins."""
@@ -224,13 +224,13 @@ def simulate(
 @jit
 def _run(
     parameters: NDArray[np.float64],
-    orders: tuple[int, int, int],
+    orders: Orders,
     offset: bool,
     u: NDArray[np.float64],
     y: NDArray[np.float64],
     plan: PlanArrays,
 ) -> NDArray[np.float64]:
-    (output_lags, input_lags, delay), (starts, running) = orders, plan
+    (output_lags, input_lags, delays), (starts, running) = orders, plan
     rows, inputs = u.shape
     run, own = np.full(rows, np.nan), np.empty(rows)
     for k in range(rows):
@@ -244,7 +244,7 @@ def _run(
             total += parameters[lag] * own[k - 1 - lag]
         for lag in range(input_lags):
             for i in range(inputs):
-                total += parameters[output_lags + lag * inputs + i] * u[k - delay - lag, i]
+                total += parameters[output_lags + lag * inputs + i] * u[k - delays[i] - lag, i]
         # A diverged simulation stays so: NaN would look like a row without a prediction.
         own[k] = min(max(total, -_DIVERGED), _DIVERGED) if total == total else _DIVERGED
         run[k] = own[k] if abs(own[k]) < _DIVERGED else np.inf
@@ -274,7 +274,7 @@ def is_stable(a: NDArray[np.float64]) -> bool:
 @jit
 def predict_with_gradient(
     theta: NDArray[np.float64],
-    orders: tuple[int, int, int, int],
+    orders: tuple[int, int, NDArray[np.int64], int],
     u: NDArray[np.float64],
     y: NDArray[np.float64],
     plan: PlanArrays,
@@ -291,7 +291,7 @@ def predict_with_gradient(
     Returns:
         The prediction, shape (rows,), and its gradient, shape (rows, parameters); NaN and 0 where it does not run.
     """
-    (lags, input_lags, delay, noise_lags), (starts, running) = orders, plan
+    (lags, input_lags, delays, noise_lags), (starts, running) = orders, plan
     rows, inputs = u.shape
     size = theta.size
     first_d = size - 2 * noise_lags
@@ -318,7 +318,7 @@ def predict_with_gradient(
             dw[k, lag] = w[k - 1 - lag]
         for lag in range(input_lags):
             for i in range(inputs):
-                dw[k, lags + lag * inputs + i] = u[k - delay - lag, i]
+                dw[k, lags + lag * inputs + i] = u[k - delays[i] - lag, i]
         if first_d > lags + input_lags * inputs:
             dw[k, first_d - 1] = 1.0
         total = 0.0

@@ -33,7 +33,7 @@ from reactorwatch.errors import InputError, UnfitRecordError
 from reactorwatch.identification.data import PlanArrays, ScaledRecord, plan_run, rows_of
 from reactorwatch.identification.least_squares import descend, least_squares, solution_at
 from reactorwatch.identification.linear_model import standard_deviations
-from reactorwatch.identification.structure import Scaling, Structure, as_columns
+from reactorwatch.identification.structure import Orders, Scaling, Structure, as_columns
 
 LARGEST_SIZE = 30  # number of terms of a NARX model beyond which no more are selected
 Product = tuple[int, ...]
@@ -140,7 +140,7 @@ def name_product(product: Product, structure: Structure, inputs: tuple[str, ...]
             names.append(f"{output}{factor + 1}")
         else:
             lag, i = divmod(factor - structure.output_lags, structure.inputs)
-            names.append(f"{inputs[i]}{structure.delay + lag}")
+            names.append(f"{inputs[i]}{structure.delays[i] + lag}")
     return "*".join(names)
 
 
@@ -320,7 +320,7 @@ def _grow(
 def run_polynomial(
     theta: NDArray[np.float64],
     factors: NDArray[np.int64],
-    orders: tuple[int, int, int],
+    orders: Orders,
     u: NDArray[np.float64],
     y: NDArray[np.float64],
     plan: PlanArrays,
@@ -341,7 +341,7 @@ def run_polynomial(
         The simulation, shape (rows,), NaN where it does not run and inf from where it has diverged to the next start,
         and its gradient by the coefficients, shape (rows, terms); without it shape (0, terms).
     """
-    (output_lags, input_lags, delay), (starts, running) = orders, plan
+    (output_lags, input_lags, delays), (starts, running) = orders, plan
     rows, inputs = u.shape
     size, degree = factors.shape
     run, own, diverged = np.full(rows, np.nan), np.zeros(rows), False
@@ -363,7 +363,7 @@ def run_polynomial(
             signals[lag] = own[k - 1 - lag]
         for lag in range(input_lags):
             for i in range(inputs):
-                signals[output_lags + lag * inputs + i] = u[k - delay - lag, i]
+                signals[output_lags + lag * inputs + i] = u[k - delays[i] - lag, i]
         total = 0.0
         for term in range(size):
             product = theta[term]

@@ -1,6 +1,6 @@
 """Structure of a linear model: orders, delay and scaling."""
 
-from typing import Self
+from typing import Self, TypeAlias
 
 import msgspec
 import numpy as np
@@ -8,44 +8,56 @@ from numpy.typing import ArrayLike, NDArray
 
 from reactorwatch.errors import InputError, UnfitRecordError
 
+Delay: TypeAlias = int | tuple[int, ...]
+"""Delay of all inputs in samples, or of each."""
+
+Orders: TypeAlias = tuple[int, int, NDArray[np.int64]]
+
 
 class Structure(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Terms of a linear model.
 
         y[k] = a1 y[k-1] + ... + a_na y[k-na] + b1 u[k-d] + ... + b_nb u[k-d-nb+1] + c.
 
-    With several inputs u[k-i] is their vector, and b_i has one value for each. A model without inputs has no b.
+    With several inputs u[k-i] is their vector, each delayed by its own d, and b_i has one value for each. A model
+    without inputs has no b.
 
     Attributes:
         output_lags: na, number of past outputs.
         input_lags: nb, number of past inputs.
         delay: d, samples from a move of the input to its first effect. An input held over [t_k, t_k+1) first shows
-            in row k+1: delay 1.
+            in row k+1: delay 1. Several inputs may have one each; equal ones are stored as one number.
         inputs: number of inputs.
         outputs: 1; stored states have it.
         offset: whether there is a term c.
 
     Raises:
-        InputError: an order or the delay below 1, or another number of outputs than 1.
+        InputError: an order or a delay below 1, another number of delays than inputs, or of outputs than 1.
     """
 
     output_lags: int
     input_lags: int
-    delay: int = 1
+    delay: Delay = 1
     inputs: int = 1
     outputs: int = 1
     offset: bool = True
 
     def __post_init__(self) -> None:
-        for name, title in _TITLES.items():
-            value, least = getattr(self, name), 0 if name == "inputs" else 1
+        if isinstance(self.delay, tuple):
+            if self.inputs and len(self.delay) != self.inputs:
+                raise InputError(f"there must be one delay for each of {self.inputs} inputs, got {self.delay}")
+            if not self.inputs or len(set(self.delay)) == 1:  # one structure has one form
+                msgspec.structs.force_setattr(self, "delay", self.delay[0] if self.inputs else 1)
+        sizes = {name: getattr(self, name) for name in _TITLES} | {"delay": min(self.delays, default=self.delay)}
+        for name, value in sizes.items():
+            least = 0 if name == "inputs" else 1
             if value < least:
-                raise InputError(f"{title} must be at least {least}, got {value}")
+                raise InputError(f"{_TITLES[name]} must be at least {least}, got {value}")
         if self.outputs != 1:
             raise InputError(f"a model has one output, got {self.outputs}: use one for each")
 
     @classmethod
-    def of_order(cls, order: int, delay: int = 1, inputs: int = 1) -> Self:
+    def of_order(cls, order: int, delay: Delay = 1, inputs: int = 1) -> Self:
         """Make a structure with equally many lags of output and input.
 
         Raises:
@@ -63,12 +75,17 @@ class Structure(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     @property
     def history(self) -> int:
         """Number of rows before row k that its equation needs."""
-        return max(self.output_lags, self.delay + self.input_lags - 1 if self.inputs else 0)
+        return max(self.output_lags, *(delay + self.input_lags - 1 for delay in self.delays), 0)
 
     @property
-    def orders(self) -> tuple[int, int, int]:
-        """Lags of the output and of the inputs, and the delay."""
-        return self.output_lags, self.input_lags, self.delay
+    def delays(self) -> tuple[int, ...]:
+        """Delay of each input."""
+        return self.delay if isinstance(self.delay, tuple) else (self.delay,) * self.inputs
+
+    @property
+    def orders(self) -> Orders:
+        """Lags of the output and of the inputs, and the delays, shape (inputs,), for kernels."""
+        return self.output_lags, self.input_lags, np.array(self.delays, dtype=np.int64)
 
     def without_offset(self) -> Self:
         """The lagged signals alone."""

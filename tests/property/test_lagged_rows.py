@@ -16,12 +16,9 @@ PERIOD_NS = 100
 def test_stream_and_record_agree(data: st.DataObject) -> None:
     """Random structures, missing values and gaps: the same rows, the same numbers."""
     small = st.integers(1, 3)
+    delays = tuple(data.draw(st.lists(small, min_size=1, max_size=2)))
     structure = Structure(
-        data.draw(small),
-        data.draw(small),
-        data.draw(small),
-        data.draw(st.integers(1, 2)),
-        offset=data.draw(st.booleans()),
+        data.draw(small), data.draw(small), delays, inputs=len(delays), offset=data.draw(st.booleans())
     )
     count = data.draw(st.integers(5, 40))
     rng = np.random.default_rng(data.draw(st.integers(0, 10_000)))

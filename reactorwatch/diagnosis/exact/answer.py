@@ -1,6 +1,7 @@
 """Report of an explanation by the exact equations: causes or law, errors, alternatives, experiment, extended model."""
 
-from collections.abc import Sequence, Set
+from collections import defaultdict
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -133,9 +134,11 @@ def answer_exactly(exact: Exact, problem: Problem, about_record: Sequence[str]) 
         for item in listed
     }
     shown, corrections = parts[best] if causes else ((), ())
-    if verdict == AMBIGUOUS and corrections:
+    weights = _join_weights(weights, {item: _names(parts[item][0]) for item in listed})
+    if corrections:
         alternatives = [item for item in alternatives if _names(parts[item][0]) != _names(shown)]
-        verdict = AMBIGUOUS if any(item.bic - best.bic < SURE for item in alternatives) else NAMED
+        if verdict == AMBIGUOUS and not any(item.bic - best.bic < SURE for item in alternatives):
+            verdict = NAMED
     experiment = _experiment(best, alternatives, exact, problem)
     if isinstance(experiment, str):
         remarks.append(experiment)
@@ -215,8 +218,18 @@ def _causes_of(item: FittedHypothesis, exact: Exact, problem: Problem) -> tuple[
     return convert_to_run_minutes(hypothesis_causes(item, covariances_of(exact.search.run, item)), problem.record)
 
 
-def _names(causes: Sequence[Cause]) -> set[str]:
-    return {item.cause for item in causes}
+def _names(causes: Sequence[Cause]) -> frozenset[str]:
+    return frozenset(item.cause for item in causes)
+
+
+def _join_weights(
+    weights: Mapping[FittedHypothesis, Weight], causes: Mapping[FittedHypothesis, frozenset[str]]
+) -> dict[FittedHypothesis, Weight]:
+    """Weights by which explanations that differ in small corrections alone are one, and their probabilities a sum."""
+    total = defaultdict[frozenset[str], float](float)
+    for item, names in causes.items():
+        total[names] += weights[item].probability
+    return {item: weights[item]._replace(probability=total[names]) for item, names in causes.items()}
 
 
 def _experiment(

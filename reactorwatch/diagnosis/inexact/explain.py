@@ -13,6 +13,7 @@ again from the residual of the best; the model is then linearised again about it
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import exp
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,11 +22,20 @@ from reactorwatch.arrays import Array
 from reactorwatch.diagnosis.fitting.profiles import Signal
 from reactorwatch.diagnosis.holdout import EVERY, blocks_of, excess, rms, share_of
 from reactorwatch.diagnosis.inexact.fit import Fitted, Fitter
-from reactorwatch.diagnosis.inexact.hypotheses import CONSTANT, CURVE, NONE, RAMP, STEP, WIDTH, Courses, Hypothesis
+from reactorwatch.diagnosis.inexact.hypotheses import (
+    CONSTANT,
+    CURVE,
+    NONE,
+    RAMP,
+    STEP,
+    WIDTH,
+    Courses,
+    Hypothesis,
+)
 from reactorwatch.diagnosis.inexact.noise import Discrepancy, estimate_discrepancy, white, white_noise_sd
 from reactorwatch.diagnosis.inexact.nuisance import Nuisance
 from reactorwatch.diagnosis.inexact.screen import Screen
-from reactorwatch.diagnosis.inexact.simulation import InexactSimulation, ProductForcing, Simulated
+from reactorwatch.diagnosis.inexact.simulation import InexactSimulation, ProductForcing, Simulated, Slopes
 from reactorwatch.diagnosis.run import Run
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.model import ProcessModel
@@ -36,7 +46,10 @@ ROUNDS = 2
 """Estimates of the discrepancy."""
 
 FIRST, LAST, A_CAUSE = 2, 7, 2
-"""Hypotheses with a cause that are fitted in each round, in the last one, and of one cause."""
+"""Hypotheses with a cause that are fitted in each round beside a curve, in the last one, and of one cause there."""
+
+ALIKE = 1e-3
+"""Difference in log evidence, by the linearised model, of hypotheses that do the same: that of rounding is smaller."""
 
 SAME = 1e-6
 """Squared difference of the residuals of two causes, over the residual's square, below which they do the same: one
@@ -116,6 +129,24 @@ def explain(
     return _Comparison(model, effects, run, starts, stated, np.asarray(smallest_sd)).run_rounds()
 
 
+class _Linear(NamedTuple):
+    """A model linearised about a simulation.
+
+    Attributes:
+        theta: nuisance of the simulation, shape (size,).
+        residual: residual at the kept rows, 0 where not measured, shape (kept rows, n_y).
+        base: derivatives of the readings by all nuisance, shape (kept rows, n_y, size).
+        causes: derivatives by every effect in all steps, then hats, shape (kept rows, n_y, effects * courses).
+        slopes: derivatives along the simulation.
+    """
+
+    theta: Array
+    residual: Array
+    base: Array
+    causes: Array
+    slopes: Slopes
+
+
 class _Comparison:
     """The rounds of `explain`, whose arguments it takes."""
 
@@ -161,11 +192,19 @@ class _Comparison:
         noise = white(np.maximum(np.sqrt(np.mean(residual**2, axis=0)), self._smallest_sd))
         for number in range(1, ROUNDS + 1):
             report_stage("comparing with nuisance, round", number, ROUNDS + 1)
-            fits = self._fit_best(self._rank(theta, simulated, noise), theta, noise, FIRST, slow_sensors=True)
-            best = max(fits, key=lambda item: item.log_evidence, default=None)
-            if best is None:
+            linear = self._linearise(theta, simulated)
+            ranked = self._rank(linear, noise)
+            chosen = _choose_first(ranked)
+            if number == 1:  # a sensor's jump stands out of what wanders, where that is no white noise
+                coloured = estimate_discrepancy(residual, self._smallest_sd)
+                chosen = _add_causes(chosen, ranked, _choose_first(self._rank(linear, coloured)))
+            fits = self._fit_all(chosen, theta, noise, slow=True)
+            if not fits:
                 return None
-            noise = estimate_discrepancy(best.residual, self._smallest_sd)
+            best, noise = max(
+                ((item, estimate_discrepancy(item.residual, self._smallest_sd)) for item in fits),
+                key=lambda pair: pair[0].log_evidence_with(pair[1]),
+            )
             theta = best.theta.copy()
             if best.hypothesis.kind in (STEP, RAMP):
                 self._courses = replace(self._courses, expected_min=best.hypothesis.onset)
@@ -176,11 +215,11 @@ class _Comparison:
                 return None
             simulated = again
         report_stage("comparing with nuisance, round", ROUNDS + 1, ROUNDS + 1)
-        fits = self._fit_best(self._rank(theta, simulated, noise), theta, noise, LAST)
+        fits = self._fit_all(_choose(self._rank(self._linearise(theta, simulated), noise), LAST), theta, noise)
         return self._explanations(fits, noise) if any(item.hypothesis.kind == NONE for item in fits) else None
 
-    def _rank(self, theta: Array, simulated: Simulated, noise: Discrepancy) -> list[Hypothesis]:
-        """All hypotheses by the model linearised about a simulation."""
+    def _linearise(self, theta: Array, simulated: Simulated) -> _Linear:
+        """Derivatives of the readings at the kept rows about a simulation."""
         sim, nuisance = self._simulation, self._nuisance
         found = nuisance.linearise(theta, simulated)
         steps, hats = self._courses.steps(), self._courses.hats()
@@ -189,34 +228,41 @@ class _Comparison:
         )
         starts = np.zeros((len(sim.begins), len(sim.model.states), len(sim.effects) * courses.interval_mean.shape[1]))
         causes = nuisance.derivatives(theta, found.slopes, starts, ProductForcing(courses))
-        whitened = noise.whiten(self._fitter.residual(theta, simulated))
-        base, causes = (noise.whiten(self._fitter.mask(item)) for item in (found.derivatives, causes))
+        residual, mask = self._fitter.residual(theta, simulated), self._fitter.mask
+        return _Linear(theta, residual, mask(found.derivatives), mask(causes), found.slopes)
+
+    def _rank(self, linear: _Linear, noise: Discrepancy) -> list[Hypothesis]:
+        """All hypotheses by the linearised model, the likeliest first."""
+        sim, nuisance, slopes = self._simulation, self._nuisance, linear.slopes
+        whitened, base, causes = (noise.whiten(item) for item in (linear.residual, linear.base, linear.causes))
         values = whitened.size
-        return Screen(
+        screen = Screen(
             nuisance,
             self._courses,
             self._widths,
-            theta,
+            linear.theta,
             whitened.ravel(),
             base.reshape(values, -1),
             causes.reshape(values, len(sim.effects), -1),
-        ).rank()
+        )
+        ranked, times = screen.rank(), self._run.time_min[self._rows]
+        for effect in np.flatnonzero(~np.any(slopes.b, axis=(0, 1))).tolist():  # errors of sensors
+            shows = np.any(slopes.d[:, :, effect], axis=0)
+            columns = slopes.d[self._rows, :, effect, None] * (times[:, None] >= times)[:, None, :]
+            jumps = noise.of(shows).whiten(self._fitter.mask(columns)[:, shows])
+            given = np.tile(shows, len(times))
+            ranked = screen.refine(ranked, effect, times, jumps.reshape(-1, times.size), given)
+        return ranked
 
-    def _fit_best(
-        self, ranked: Sequence[Hypothesis], theta: Array, noise: Discrepancy, count: int, *, slow_sensors: bool = False
+    def _fit_all(
+        self, chosen: Sequence[Hypothesis], theta: Array, noise: Discrepancy, *, slow: bool = False
     ) -> list[Fitted]:
-        """Fit no cause, and the best hypotheses with one; also from slow sensors, if these are possible."""
-        none = next(item for item in ranked if item.kind == NONE)
-        chosen: dict[tuple[str, int], Hypothesis] = {}
-        for item in ranked:
-            same = sum(index == item.effect for _, index in chosen)
-            if item.kind != NONE and item.cause not in chosen and same < A_CAUSE and len(chosen) < count:
-                chosen[item.cause] = item
-        slow = theta.copy()
-        slow[self._nuisance.output_lags] = self._nuisance.lag_start_min
+        """Fit hypotheses; with `slow` also from slow sensors, if these are possible."""
+        late = theta.copy()
+        late[self._nuisance.output_lags] = self._nuisance.lag_start_min
         result = []
-        for item in track("fitting with nuisance, hypothesis", (none, *chosen.values())):
-            starts = [theta, slow] if slow_sensors and item.prior.lam == 1.0 else [theta]
+        for item in track("fitting with nuisance, hypothesis", chosen):
+            starts = [theta, late] if slow and item.prior.lam == 1.0 else [theta]
             fits = [fit for start in starts if (fit := self._fitter.fit(item, start, noise)) is not None]
             result += [max(fits, key=lambda fit: fit.log_evidence)] if fits else []
         return result
@@ -295,3 +341,47 @@ class _Comparison:
             return False
         a, b = (item.fitted.residual.ravel() for item in (one, other))
         return bool(np.sum((a - b) ** 2) < SAME * np.sum(a**2))
+
+
+def _choose(ranked: Sequence[Hypothesis], count: int) -> list[Hypothesis]:
+    """No cause, and the likeliest hypotheses with one."""
+    none = next(item for item in ranked if item.kind == NONE)
+    chosen: dict[tuple[str, int], Hypothesis] = {}
+    for item in ranked:
+        same = sum(index == item.effect for _, index in chosen)
+        if item.kind != NONE and item.cause not in chosen and same < A_CAUSE and len(chosen) < count:
+            chosen[item.cause] = item
+    return [none, *chosen.values()]
+
+
+def _choose_first(ranked: Sequence[Hypothesis]) -> list[Hypothesis]:
+    """No cause, the likeliest curve and the likeliest hypotheses of other profiles, of those that do the same one.
+
+    Of these the discrepancy is estimated. A curve imitates what wanders, and in white noise it is likelier than any
+    cause that does not.
+    """
+    chosen: list[Hypothesis] = []
+    for item in ranked:
+        alike = sum((other.kind == CURVE) == (item.kind == CURVE) for other in chosen)
+        is_open = item.kind != NONE and alike < (1 if item.kind == CURVE else FIRST)
+        if is_open and not any(_seem_the_same(item, other) for other in chosen):
+            chosen.append(item)
+    return [next(item for item in ranked if item.kind == NONE), *chosen]
+
+
+def _add_causes(
+    chosen: Sequence[Hypothesis], ranked: Sequence[Hypothesis], others: Sequence[Hypothesis]
+) -> list[Hypothesis]:
+    """Hypotheses, and those of a ranking with the causes and courses of others."""
+    result = list(chosen)
+    for other in others:
+        if not any(_seem_the_same(other, item) for item in chosen):
+            same = next(item for item in ranked if item.cause == other.cause)
+            result.append(same._replace(onset=other.onset, size=other.size))
+    return result
+
+
+def _seem_the_same(one: Hypothesis, other: Hypothesis) -> bool:
+    """True of one cause with two priors, and of twins, such as the gains of a pump and of its signal."""
+    are_twins = one.onset == other.onset and abs(one.log_evidence - other.log_evidence) < ALIKE
+    return one.cause == other.cause or (one.kind == other.kind and are_twins)

@@ -58,6 +58,7 @@ class Fitted:
         white: the same whitened.
         white_residual: whitened residual.
         information: information of all parameters, their priors included, shape (n, n).
+        discrepancy: discrepancy with which it was fitted.
     """
 
     hypothesis: Hypothesis
@@ -72,11 +73,18 @@ class Fitted:
     white: Array
     white_residual: Array
     information: Array
+    discrepancy: Discrepancy
 
     @property
     def log_evidence(self) -> float:
         """Logarithm of the evidence."""
         return self.hypothesis.log_evidence
+
+    def log_evidence_with(self, discrepancy: Discrepancy) -> float:
+        """The same with another discrepancy, the parameters and their share of the evidence as they are."""
+        values, white = np.count_nonzero(self.residual, axis=0), discrepancy.whiten(self.residual)
+        gained = values @ np.log(self.discrepancy.sd / discrepancy.sd)
+        return self.log_evidence + float(gained + 0.5 * (np.sum(self.white_residual**2) - np.sum(white**2)))
 
     def residual_without(self, hidden: NDArray[np.bool_]) -> Array:
         """Residual at these of the kept rows of a fit to the others, by the derivatives of this fit."""
@@ -278,4 +286,5 @@ class _Fit:
             white,
             point.white,
             information,
+            self._noise,
         )

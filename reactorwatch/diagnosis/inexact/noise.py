@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from math import log, sqrt
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg.lapack import dtbtrs
 
 from reactorwatch.arrays import Array
@@ -29,6 +30,10 @@ class Discrepancy:
     a: Array
     b: Array
     sd: Array
+
+    def of(self, outputs: NDArray[np.bool_]) -> "Discrepancy":
+        """That of some outputs."""
+        return Discrepancy(self.a[outputs], self.b[outputs], self.sd[outputs])
 
     def whiten(self, values: Array) -> Array:
         """Whiten residuals or their derivatives, shape (rows, n_y, ...), in the standard deviation of e."""

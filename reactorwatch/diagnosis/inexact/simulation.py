@@ -33,6 +33,10 @@ ACCURATE = 1e-4
 """Difference between integrations with a number of steps in a row and with twice as many, in scales of the states,
 below which the smaller number is taken: a hundredth of what the noise of a good sensor is."""
 
+DIVERGED = 1e6
+"""States from which on a simulation has diverged, in their scales and first values: no plant returns from there, and
+squares of what follows are still numbers."""
+
 MOST_ROWS = 1500
 """Rows at which derivatives are kept; of a longer run every second row, or every third, and so on."""
 
@@ -95,6 +99,7 @@ class InexactSimulation:
             extended = effect.extend(extended)
         self.typical = np.array([abs(effect.typical) for effect in self.effects])
         self._neutral = np.array([effect.neutral for effect in self.effects])
+        self._scales = np.array([state.scale for state in model.states])
         rows = run.time_min.size
         self.rows: NDArray[np.intp] = np.arange(0, rows, -(-rows // MOST_ROWS))
         self.begins = (0, *run.breaks)
@@ -161,7 +166,7 @@ class InexactSimulation:
                 arguments = self._arguments(inputs[part], eta[part], part)
                 (states,) = self._step_after_step.map(start, *arguments)
                 x[begin + 1 : end] = states[self._steps - 1 :: self._steps, :, 0]
-        if not np.all(np.isfinite(x)):
+        if not np.all(np.abs(x) < DIVERGED * (self._scales + np.max(np.abs(starts), axis=0))):
             return None
         true, y = (
             _by_column(self._output.map(x, self.run.inputs, sizes, self.run.time_min)[0])[:, :, 0]

@@ -6,6 +6,7 @@ From it come the names that `[monitor] charts` takes, the charts' own keys there
 from reactorwatch.spc.charts.base import Chart
 from reactorwatch.spc.charts.cusum import Cusum
 from reactorwatch.spc.charts.cva_residual import CvaResidual
+from reactorwatch.spc.charts.edetector import EDetector
 from reactorwatch.spc.charts.ewma import Ewma
 from reactorwatch.spc.charts.mewma import Mewma
 from reactorwatch.spc.charts.multiple_pca import MultiplePca
@@ -21,6 +22,7 @@ CHARTS: tuple[type[Chart], ...] = (
     Shewhart,
     Ewma,
     Cusum,
+    EDetector,
     T2,
     Mewma,
     PcaT2,

@@ -8,25 +8,30 @@ from typing import cast
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from scipy.linalg import expm
+from scipy.signal import lfilter
 from scipy.stats import multivariate_normal
 
 from benchmarks.inexact import two_heaters
 from benchmarks.inexact.records import Drawn, write_files
 from reactorwatch.api.diagnosis import diagnose
 from reactorwatch.api.records import read_record
+from reactorwatch.diagnosis.diagnose import diagnose as find_causes
 from reactorwatch.diagnosis.fitting.descent import Equations, descend
 from reactorwatch.diagnosis.fitting.profiles import Signal
 from reactorwatch.diagnosis.inexact.answer import relative_delays
 from reactorwatch.diagnosis.inexact.explain import Explained, Explanation, explain
-from reactorwatch.diagnosis.inexact.hypotheses import CONSTANT, STEP, WIDTH, Courses
-from reactorwatch.diagnosis.inexact.noise import estimate_discrepancy
+from reactorwatch.diagnosis.inexact.fit import Fitter
+from reactorwatch.diagnosis.inexact.hypotheses import CONSTANT, NONE, STEP, WIDTH, Courses, Hypothesis
+from reactorwatch.diagnosis.inexact.noise import estimate_discrepancy, white
 from reactorwatch.diagnosis.inexact.nuisance import Nuisance, Prior
 from reactorwatch.diagnosis.inexact.screen import Screen
 from reactorwatch.diagnosis.inexact.simulation import InexactSimulation, ProductForcing
 from reactorwatch.diagnosis.run import Run
 from reactorwatch.process import effects_of
 from reactorwatch.process.library.cascaded_tanks import tanks
-from reactorwatch.process.model import ProcessModel
+from reactorwatch.process.model import Output, ProcessModel, new_clock, parameter, variable
+from reactorwatch.records.record import Record
 
 ROWS, PERIOD_MIN = 240, 0.1
 TIME = np.asarray(PERIOD_MIN * np.arange(ROWS), dtype=float)
@@ -203,6 +208,18 @@ def test_a_descent_ends_where_its_equations_cannot_be_solved(known: float | None
     assert descend(start, equations, lambda point, step: None, 5) is start
 
 
+def test_a_simulation_that_has_left_the_record_is_no_fit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An unstable plant may end in numbers whose squares are none."""
+    _, run, nuisance = plant()
+    step = nuisance.simulation._step_after_step
+    monkeypatch.setattr(
+        step, "map", lambda *given: [1e200 * (1.0 + np.abs(item)) for item in type(step).map(step, *given)]
+    )
+    measured, theta = run.measured[nuisance.simulation.rows], np.zeros(nuisance.size)
+    fitter = Fitter(nuisance, Courses(TIME, PERIOD_MIN), {}, measured)
+    assert fitter.fit(Hypothesis(NONE, -1, nuisance.priors[0]), theta, white(np.ones(measured.shape[1]))) is None
+
+
 def test_without_effects_there_is_no_explanation() -> None:
     model, run, _ = plant()
     start = np.array([[0.5 * (item.lower + item.upper) for item in model.states]])
@@ -249,6 +266,47 @@ def test_the_onset_of_a_sensors_error_is_not_known_better_than_to_a_row(output: 
     onset = diagnose(read_record(path, process=process)).causes[0].parameters["onset"]
     assert onset.sd >= drawn.period_min / 12.0**0.5
     assert onset.value == pytest.approx(drawn.cause.onset_min, abs=4.0 * onset.sd)
+
+
+OUTLET_1_PER_MIN = 0.2
+
+
+def two_tanks() -> ProcessModel:
+    """A tank that drains into a second one, each with a flow of its own."""
+    flows = [variable(f"F{i}", "m3/min", (0.0, 4.0), 0.5, f"flow to tank {i}") for i in (1, 2)]
+    levels = [variable(f"h{i}", "m", (0.0, 20.0), 1.0, f"level {i}", balance=f"tank{i}") for i in (1, 2)]
+    outlets = [parameter(f"k{i}", OUTLET_1_PER_MIN, "m2/min", (0.0, 1.0), f"outlet {i}") for i in (1, 2)]
+    (f1, f2), (h1, h2), (k1, k2) = ([item.symbol for item in items] for items in (flows, levels, outlets))
+    rates = (f1 - k1 * h1, f2 + 0.5 * k1 * h1 - k2 * h2)
+    outputs = tuple(Output(item.name, "m", item.symbol) for item in levels)
+    return ProcessModel("two_tanks", tuple(levels), tuple(flows), tuple(outlets), rates, outputs, new_clock())
+
+
+def record_of_two_tanks(seed: int, onset: int, bias: float) -> Record:
+    """Levels by the exact solution; both flows wander unseen, and the second sensor has an error from a row on."""
+    rng, rows = np.random.default_rng(seed), 1000
+    flows = np.repeat(rng.uniform(0.5, 1.5, (rows // 50, 2)), 50, axis=0)
+    wander = 0.012 * lfilter([0.31], [1.0, -0.95], rng.standard_normal((rows, 2)), axis=0)
+    a = OUTLET_1_PER_MIN * np.array([[-1.0, 0.0], [0.5, -1.0]])
+    step = expm(PERIOD_MIN * a)
+    held, levels = np.linalg.solve(a, step - np.eye(2)), [np.array([5.0, 7.5])]
+    for flow in (flows + wander)[:-1]:
+        levels.append(step @ levels[-1] + held @ flow)
+    shown = np.array(levels) + 0.01 * rng.standard_normal((rows, 2))
+    shown[onset:, 1] += bias
+    columns = {"F1": flows[:, 0], "F2": flows[:, 1], "h1": shown[:, 0], "h2": shown[:, 1]}
+    return Record(PERIOD_MIN * np.arange(rows, dtype=np.float64), columns, "two tanks")
+
+
+@pytest.mark.parametrize(
+    ("seed", "onset", "bias"), [(1, 447, -0.25), pytest.param(2, 418, 0.25, marks=pytest.mark.slow)]
+)
+def test_a_step_of_a_sensor_is_named_at_any_row_where_inputs_wander_unseen(seed: int, onset: int, bias: float) -> None:
+    found = find_causes(record_of_two_tanks(seed, onset, bias), two_tanks())
+    (cause,) = found.causes
+    assert cause.cause == "h2.bias"
+    assert cause.parameters["size"].value == pytest.approx(bias, abs=0.03)
+    assert cause.parameters["onset"].value == pytest.approx(onset * PERIOD_MIN, abs=PERIOD_MIN)
 
 
 @pytest.mark.slow

@@ -167,6 +167,8 @@ def test_a_law_stays_unless_a_cause_with_an_onset_explains_the_record() -> None:
     assert decide(UNKNOWN, 0.0, 4.0, WITHIN, [curve], is_law=True) == Verdict(UNKNOWN, "nearest")
     assert decide(UNKNOWN, 0.0, 4.0, WITHIN, [part], is_law=True) == Verdict(UNKNOWN, "nearest")
     assert decide(UNKNOWN, 0.0, 4.0, WITHIN, [CAUSE], is_law=True).verdict == NAMED
+    rough = CAUSE._replace(left=22.0)  # more than the law leaves
+    assert decide(UNKNOWN, 0.0, 0.3, WITHIN, [rough], is_law=True).verdict == UNKNOWN
     assert decide(UNKNOWN, 0.0, 4.0, WITHIN, constant, is_law=True) == Verdict(UNKNOWN, "nearest")
     nothing = WITHIN._replace(left=0.1)
     assert decide(UNKNOWN, 0.0, 4.0, nothing, constant, is_law=True) == Verdict(UNKNOWN, "nearest")

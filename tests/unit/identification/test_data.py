@@ -1,5 +1,6 @@
 """Structures, scaling with its undoing, and regressors from a record."""
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -86,10 +87,31 @@ def test_a_row_holds_past_outputs_then_past_inputs_then_one() -> None:
     np.testing.assert_array_equal(rows.outputs[0], [3.0])
 
 
-def test_several_signals_stand_side_by_side_at_each_lag() -> None:
-    structure = Structure(1, 2, inputs=2, offset=False)
+@pytest.mark.parametrize(
+    ("delay", "first", "regressor"),
+    [
+        (1, 2, [1.0, 11.0, -11.0, 10.0, -10.0]),
+        ((1, 3), 4, [3.0, 13.0, -11.0, 12.0, -10.0]),
+        ((4, 1), 5, [4.0, 11.0, -14.0, 10.0, -13.0]),
+    ],
+)
+def test_several_inputs_stand_side_by_side_at_each_lag_each_with_its_delay(
+    delay: int | tuple[int, int], first: int, regressor: list[float]
+) -> None:
+    structure = Structure(1, 2, delay, inputs=2, offset=False)
     rows = rows_of(structure, np.column_stack([U, -U]), Y)
-    np.testing.assert_array_equal(rows.regressors[0], [1.0, 11.0, -11.0, 10.0, -10.0])
+    assert rows.position[0] == first
+    np.testing.assert_array_equal(rows.regressors[0], regressor)
+
+
+def test_equal_delays_of_the_inputs_are_one_delay() -> None:
+    assert Structure(2, 2, (3, 3), 2) == Structure(2, 2, 3, 2)
+    assert Structure(2, 2, (1, 3), 2).delays == (1, 3)
+    assert msgspec.structs.replace(Structure(2, 2, (1, 3), 2), inputs=0).history == 2
+    with pytest.raises(InputError, match=r"one delay for each of 2 inputs, got \(1, 2, 3\)"):
+        Structure(2, 2, (1, 2, 3), 2)
+    with pytest.raises(InputError, match=r"delay .* at least 1, got 0"):
+        Structure(2, 2, (4, 0), 2)
 
 
 def test_missing_values_and_gaps_cost_the_rows_that_reach_over_them() -> None:

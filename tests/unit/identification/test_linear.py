@@ -38,7 +38,7 @@ from tests.unit.identification.truth import (
 def recursion(parameters: Array, inputs: Array, structure: Structure, start: Array) -> Array:
     """The recursion of one input and output, written out."""
     y = list(start)
-    n, m, d = structure.output_lags, structure.input_lags, structure.delay
+    n, m, (d,) = structure.output_lags, structure.input_lags, structure.delays
     for k in range(len(start), len(inputs)):
         past = sum(parameters[i] * y[k - 1 - i] for i in range(n))
         driven = sum(parameters[n + j] * inputs[k - d - j] for j in range(m))
@@ -180,12 +180,12 @@ def test_the_gradient_is_the_derivative_of_the_prediction(
     """Against central differences, over a missing output, a missing input and a gap."""
     u, y = BOX_JENKINS.simulate(80, 1)
     y[20], u[40] = np.nan, np.nan
-    structure = Structure(*orders[:3], 2)
+    structure = Structure(*orders[:2], (orders[2], orders[2] + 2), 2)
     plan = plan_run(structure, u, y[:, None], np.where(np.arange(80) < 60, np.arange(80.0), np.arange(80.0) + 9.0))
     assert plan.starts.sum() == 3
 
     def predict(parameters: Array) -> tuple[Array, Array]:
-        return predict_with_gradient(parameters, orders, u, y, plan.arrays)
+        return predict_with_gradient(parameters, (*structure.orders, orders[-1]), u, y, plan.arrays)
 
     predicted, gradient = predict(np.array(theta))
     assert np.isfinite(predicted[20])

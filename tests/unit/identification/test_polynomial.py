@@ -133,7 +133,7 @@ def test_the_gradient_is_the_derivative_of_the_simulation() -> None:
     theta = np.random.default_rng(2).uniform(-0.1, 0.1, len(products))
 
     def run(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return run_polynomial(values, factors_of(products), (2, 2, 1), u, y[:, 0], plan.arrays, True)
+        return run_polynomial(values, factors_of(products), structure.orders, u, y[:, 0], plan.arrays, True)
 
     _, gradient = run(theta)
     for i in range(theta.size):

@@ -87,6 +87,27 @@ def test_the_alarm_names_the_signal_at_which_the_disturbance_enters(faulty: int)
     assert len(suspected[-1].suspects) == 3
 
 
+@pytest.mark.parametrize("ends", [True, False])
+def test_the_end_of_an_anomaly_is_an_event_of_the_same_incident(ends: bool) -> None:
+    """Also where the monitor is stored and resumed within the anomaly."""
+    values = plant(TRAINING + 240)
+    first, end = TRAINING + 60, TRAINING + 160 if ends else TRAINING + 240
+    values[2, first:end] += 8.0 * values[2, :TRAINING].std()
+    whole = Monitor(settings(), 0)
+    said = watch(whole, values)
+    changes = [alarm for alarm in raised(said) if alarm.alarm == "change/all"]
+    assert len(changes) == ends
+    if ends:
+        (change,) = changes
+        assert change.incident == raised(said)[0].incident == 1
+        assert change.text.startswith("the plant moves again: y2 by -")
+        assert change.contributions[0].signal == "y2"
+    before, after = Monitor(settings(), 0), Monitor(settings(), 0)
+    heard = watch(before, values[:, : TRAINING + 150])
+    after.from_bytes(before.to_bytes())
+    assert heard + watch(after, values, TRAINING + 150) == said
+
+
 def test_a_monitor_that_resumes_publishes_the_same_bit_for_bit() -> None:
     """Stored before and in the alarm."""
     values = plant(TRAINING + 140, TRAINING + 100)

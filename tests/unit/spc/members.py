@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from reactorwatch.spc.charts.cusum import Cusum, cusum_run_length
 from reactorwatch.spc.charts.cva_residual import CvaResidual
+from reactorwatch.spc.charts.edetector import EDetector
 from reactorwatch.spc.charts.ewma import Ewma, ewma_run_length
 from reactorwatch.spc.charts.mewma import Mewma, mewma_run_length
 from reactorwatch.spc.charts.multiple_pca import MultiplePca
@@ -105,6 +106,9 @@ MEMBERS: dict[type, Member] = {
         lambda: Shewhart(MEAN, SIGMA, rules=(1, 2, 3, 4)), value, shewhart_run_length(SHIFT, rules=(1, 2, 3, 4))
     ),
     Cusum: Member(lambda: Cusum(MEAN, SIGMA, 0.5, 4.0, 2.0), value, cusum_run_length(SHIFT, 0.5, 4.0, 2.0)),
+    EDetector: Member(  # by 200,000 runs of the recursion in numpy, to 0.02
+        lambda: EDetector(MEAN, SIGMA, 100.0), value, 16.076
+    ),
     Ewma: Member(
         lambda: Ewma(MEAN, SIGMA, 0.1, 2.8, exact_limits=True),
         value,
