@@ -134,8 +134,8 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
             nominal reactor where its signals are watched; empty: no equations judge.
         charts: charts of the residuals and of the values; where none are named, `residual_space` for 8 outputs or more
             that no equations judge, with `cva_residual` from 20 on, else `shewhart`, `ewma` and `mewma`.
-        false_alarms_per_30_days: number of false alarms in 30 days of the plant, over all alarms; None: 1, or the
-            nearest number that the charts can keep for the number of alarms and the sampling period.
+        false_alarms_per_30_days: number of false alarms in 30 days of the plant, over all alarms; None: 1, or 1
+            in 8,640 rows if rows are slower than 5 min; the fewest that the charts can keep if that is more.
         smallest_sd: least standard deviation of the residual by output, in its unit; smaller deviations do not matter.
         isolation: true to search the cause of an alarm, if equations judge.
         isolation_rows: number of newest rows in that search.

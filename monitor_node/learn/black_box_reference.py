@@ -176,6 +176,11 @@ class BlackBoxReference(FilterReference):
     @property
     def weakness(self) -> str:
         """See `Reference`."""
+        if self.model.error_ratio > 2.0:  # 1 or 2 where the form of the model is right
+            return (
+                "the black box is off by more than the noise where it was not fitted: at inputs that the training had "
+                "rarely, false alarms may be more than promised; train over more set points, or give the equations"
+            )
         if self.model.dynamics_sd <= 0.2:
             return ""
         return (

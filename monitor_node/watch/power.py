@@ -94,7 +94,7 @@ def state_power(watch: Watch, rows: TrainingRows) -> list[Power]:
     steps = smallest_sizes(stepped, [*watch.detectors, *tests], horizons, 0.0)
     ramps = smallest_sizes(paths, watch.detectors, horizons, horizons[-1])
     return [
-        _message(item, profile, sizes)
+        _message(item, profile, sizes, watch.period_min)
         for profile, found in (("", steps), (RAMP, ramps))
         for item, sizes in zip(deviations, found.tolist(), strict=True)
     ]
@@ -118,11 +118,11 @@ def _add_step_tests(watch: Watch, names: Sequence[str], paths: Array) -> tuple[A
     return np.concatenate([paths, statistics], axis=3), tests
 
 
-def _message(deviation: Deviation, profile: str, sizes: Sequence[float]) -> Power:
+def _message(deviation: Deviation, profile: str, sizes: Sequence[float], period_min: float) -> Power:
     power = Power(deviation=deviation.name, unit=deviation.unit, profile=profile)
     for name, minutes, size in zip(FIELDS, HORIZONS_MIN, sizes, strict=True):
         reached = size * minutes / HORIZONS_MIN[-1] if profile else size
-        if isfinite(size) and reached <= deviation.largest:
+        if isfinite(size) and reached <= deviation.largest and minutes >= period_min:  # a row has come by then
             setattr(power, name, size)
     return power
 

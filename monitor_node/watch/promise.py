@@ -31,7 +31,7 @@ from reactorwatch.contract.alarm_states import Event
 from reactorwatch.contract.codec import Publication
 from reactorwatch.contract.messages_pb2 import Alarm, Check, Promise
 from reactorwatch.process.model import ProcessModel
-from reactorwatch.sentences.promise import describe_broken_promise, describe_promise
+from reactorwatch.sentences.promise import describe_broken_promise, describe_promise, describe_rate
 from reactorwatch.spc import false_alarm_budget
 from reactorwatch.spc.false_alarm_budget import QUANTILE
 from reactorwatch.stored_state import Memory, Storable
@@ -44,22 +44,25 @@ def share_budget(asked: float | None, chance_alarms: int, period_min: float, che
     """In-control run length of each alarm, in rows: the false alarms that are promised, shared by all alarms.
 
     Args:
-        asked: false alarms in 30 days that the settings ask for; None: the usual number.
+        asked: false alarms in 30 days that the settings ask for; None: the default.
         chance_alarms: number of alarms that can be false alarms.
         period_min: time between rows.
-        checks: gains a remark where the usual number cannot be promised.
+        checks: gains a remark where another number than 1 is promised and none was asked for.
 
     Raises:
         InputError: the charts cannot keep the rate that the settings ask for.
     """
-    usual = false_alarm_budget.USUAL_PER_30_DAYS
     promised = false_alarm_budget.promise_per_30_days(asked, chance_alarms, period_min)
-    if asked is None and promised != usual:
-        text = (
-            f"{promised:.3g} false alarms in 30 days are promised instead of {usual:g}: that is the nearest that "
+    if asked is None and f"{promised:.3g}" != "1":
+        rows, most = false_alarm_budget.DAYS_MIN / period_min, false_alarm_budget.USUAL_ROWS
+        why = (
+            f"{promised:.3g} false alarms in 30 days are promised instead of 1: that is the nearest that "
             f"the charts can keep for {chance_alarms} alarms and rows every {period_min:.3g} min"
+            if promised > 1.0
+            else f"1 false alarm in {most:,.0f} rows is promised, {describe_rate(promised)}: in 30 days there are only "
+            f"{rows:.3g} rows; set false_alarms_per_30_days for another number"
         )
-        checks.append(Check(name="promise", result=text))
+        checks.append(Check(name="promise", result=why))
     return false_alarm_budget.share_arl0(promised, chance_alarms, period_min)
 
 
@@ -156,7 +159,7 @@ class PlantPromise(Memory):
             drifted=self.has_drifted(rows),
             power=Promise.FromString(self.power).power,
         )
-        message.text = describe_promise(message)
+        message.text = describe_promise(message, self.rows_in_30_days)
         return message
 
 

@@ -7,6 +7,7 @@ from reactorwatch.description.process import Process
 from reactorwatch.description.read import ProcessChoice, find_process
 from reactorwatch.errors import InputError, describe_unknown
 from reactorwatch.identification.data import Dataset
+from reactorwatch.identification.dead_time import resolve_delay
 from reactorwatch.identification.identify import ModelForm, identify
 from reactorwatch.identification.selection import Selection, select
 from reactorwatch.process import DEFAULT_PROCESS
@@ -65,12 +66,25 @@ def compare(
     orders, texts = range(1, form.order + 1), []
     for output in outputs:
         data = Dataset.of_record(measured, inputs, output)
-        data.split(data.rows // 2)[0].check_movement()
-        selection = select(*data.arrays, orders=orders, delay=form.delay)
+        fitted, _ = data.split(data.rows // 2)
+        fitted.check_movement()
+        delay = resolve_delay(form.delay, fitted)
+        selection = select(*data.arrays, orders=orders, delay=delay)
         text = f"{selection.table()}\n\n{selection.reason}"
         heading = f"{output}\n" if len(outputs) > 1 else ""
         texts.append(_selection_json(selection, output) if as_json else f"{heading}{text}")
     return "\n".join(texts) if as_json else "\n\n".join(texts) + notes_text(measured.remarks)
+
+
+def read_delay(text: str) -> int | str | dict[str, int]:
+    """Delay of the command line: a number, `auto`, or `u1=3,u2=15`."""
+    try:
+        if "=" in text:
+            pairs = (part.rpartition("=") for part in text.split(","))
+            return {name.strip(): int(value) for name, _, value in pairs}
+        return text if text == "auto" else int(text)
+    except ValueError:
+        raise InputError(f"--delay must be a number of samples, auto, or u1=3,u2=15, got {text!r}") from None
 
 
 def _selection_json(selection: Selection, output: str) -> str:

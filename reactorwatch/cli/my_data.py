@@ -161,7 +161,9 @@ def identify(
     ] = None,
     model: Annotated[str, Option(help="arx, oe, armax, bj (Box-Jenkins), narx or noe (polynomials).")] = "arx",
     order: Annotated[int, Option(help="Lags of the output, each input and the disturbance.")] = 3,
-    delay: Annotated[int, Option(help="Samples from a move of an input to its first effect.")] = 1,
+    delay: Annotated[
+        str, Option(help="Samples from a move of an input to its first effect: N, auto (searched), or u1=3,u2=15.")
+    ] = "1",
     validate: Annotated[
         Path | None, Option(help="A record to validate on; all of FILE is then fitted [the second half].")
     ] = None,
@@ -189,7 +191,7 @@ def identify(
     form = ModelForm(
         model,
         order,
-        delay,
+        identification.read_delay(delay),
         recursive=recursive,
         forgetting=forgetting,
     )

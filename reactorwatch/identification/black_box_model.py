@@ -88,6 +88,8 @@ class BlackBoxModel(msgspec.Struct, frozen=True):
         r: variances of the measurements of each output.
         q: variances of the process from row to row, of each output.
         numbers: parameters and the lower triangle of their covariance, as doubles.
+        error_ratio: ratio of the errors of the parameters, by blocks of the training that were held out, to their
+            standard deviations, a power of 2; above 2 the model's own error is larger than the noise explains.
     """
 
     outputs: int
@@ -103,6 +105,7 @@ class BlackBoxModel(msgspec.Struct, frozen=True):
     r: tuple[float, ...]
     q: tuple[float, ...]
     numbers: bytes
+    error_ratio: float = 1.0
 
     @classmethod
     def of(

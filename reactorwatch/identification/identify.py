@@ -12,6 +12,7 @@ from reactorwatch.arrays import Array
 from reactorwatch.errors import InputError, UnfitRecordError, describe_unknown
 from reactorwatch.identification.checks import DEFAULT_LAGS, check_record, independence, whiteness
 from reactorwatch.identification.data import Dataset, RunPlan, plan_run, rows_of
+from reactorwatch.identification.dead_time import resolve_delay
 from reactorwatch.identification.least_squares import SINGULAR_CONDITION, LeastSquares
 from reactorwatch.identification.linear import fit_linear, unscale
 from reactorwatch.identification.linear_model import Kind, LinearModel, fit_percent, simulate
@@ -43,7 +44,8 @@ class ModelForm:
         model: `arx`, `oe`, `armax`, `bj` (Box-Jenkins), `narx` or `noe` (polynomials of degree 2, fitted by one-step
             prediction, and of degree 3, fitted by simulation).
         order: number of lags of the output, of each input and of the disturbance.
-        delay: samples from a move of an input to its first effect, at least 1.
+        delay: samples from a move of an input to its first effect, at least 1; one by the name of each input; or
+            `auto`, which searches them in the rows to fit.
         recursive: whether an ARX model is learned row by row, by recursive least squares, instead of from all rows at
             once.
         forgetting: forgetting factor of recursive least squares, in (0, 1].
@@ -54,7 +56,7 @@ class ModelForm:
 
     model: str = "arx"
     order: int = 3
-    delay: int = 1
+    delay: int | str | dict[str, int] = 1
     recursive: bool = False
     forgetting: float = 1.0
 
@@ -145,7 +147,7 @@ class Identification(Result, frozen=True):
     Attributes:
         model: `arx`, `oe`, `armax`, `bj`, `narx` or `noe`.
         order: n.
-        delay: delay in samples.
+        delay: delay in samples; by the names of the inputs where they differ.
         output: name of the output.
         rows: number of rows of the fitted part.
         recursive: whether it was learned row by row.
@@ -167,7 +169,7 @@ class Identification(Result, frozen=True):
 
     model: str
     order: int
-    delay: int
+    delay: int | dict[str, int]
     output: str
     rows: int
     recursive: bool
@@ -209,8 +211,10 @@ def identify(
             rows, a signal that does not move, inputs that do not excite the order.
     """
     form = form or ModelForm()
-    structure = Structure.of_order(form.order, form.delay, data.inputs.shape[1])
     fitted, held_out = data.split(data.rows // 2) if validation is None else (data, validation)
+    if form.delay == "auto":
+        fitted.check_movement()
+    structure = Structure.of_order(form.order, resolve_delay(form.delay, fitted), data.inputs.shape[1])
     _check_rows(structure, form, fitted, held_out, settle)
     fitted.check_movement()
     checks = {check.name: check.result for check in check_record(structure, *fitted.arrays)}
@@ -227,7 +231,7 @@ def identify(
         white = whiteness(residuals, lags, of_own_past).minus_log10_p
         checks["whiteness"] = _verdict(white, "the residuals are correlated with each other")
         if structure.inputs:
-            free = independence(residuals, fitted.inputs, form.delay, time=fitted.time)
+            free = independence(residuals, fitted.inputs, structure.delay, time=fitted.time)
             checks["independence"] = _verdict(free.minus_log10_p, "the residuals are correlated with past inputs")
     predicted, run = model.predict(*held_out.arrays)[:, 0], free_run(model, held_out, settle)
     predicted[:settle] = np.nan
@@ -236,7 +240,9 @@ def identify(
     return Identification(
         model=form.model,
         order=form.order,
-        delay=form.delay,
+        delay=structure.delay
+        if isinstance(structure.delay, int)
+        else dict(zip(data.input_names, structure.delay, strict=True)),
         output=data.output_name,
         rows=fitted.rows,
         recursive=form.recursive,
@@ -313,8 +319,9 @@ def _check_rows(structure: Structure, form: ModelForm, fitted: Dataset, held_out
     least = structure.history + structure.parameters + of_noise
     if fitted.rows <= least:
         raise UnfitRecordError(
-            f"order {form.order} with delay {form.delay} needs more than {least} rows to fit, the first half of the "
-            f"record unless another validates, got {fitted.rows}; lower the order, or record for longer"
+            f"order {form.order} with delay {max(structure.delays, default=1)} needs more than {least} rows to fit, "
+            f"the first half of the record unless another validates, got {fitted.rows}; "
+            "lower the order, or record for longer"
         )
     if settle < 0:
         raise InputError(f"settle must be at least 0 rows, got {settle}")

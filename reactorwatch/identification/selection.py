@@ -24,7 +24,7 @@ from reactorwatch.arrays import Array
 from reactorwatch.errors import InputError, UnfitRecordError
 from reactorwatch.identification.linear import fit_linear
 from reactorwatch.identification.linear_model import fit_percent
-from reactorwatch.identification.structure import Structure, as_columns
+from reactorwatch.identification.structure import Delay, Structure, as_columns
 
 EQUAL_PERCENT = 0.5  # difference of fits that counts as none
 LEAST_PERCENT = 20.0  # fit on the held-out half: with less no model is recommended (the mean alone has 0 %)
@@ -119,7 +119,7 @@ def select(
     time: ArrayLike | None = None,
     fits: Mapping[str, Fit] = LINEAR_FITS,
     orders: Sequence[int] = (1, 2, 3),
-    delay: int = 1,
+    delay: Delay = 1,
 ) -> Selection:
     """Fit every order of every family to the first half of a record, and choose by the second.
 
@@ -129,7 +129,7 @@ def select(
         time: shape (rows,); None: gaps are not detected.
         fits: fits to compare, by the name of the family.
         orders: orders to compare.
-        delay: delay of the input, in samples.
+        delay: delay of the inputs, in samples, or of each.
 
     Raises:
         InputError: no family, an order or delay below 1, or a record that no model can be fitted to.

@@ -21,9 +21,15 @@ def identification_headline(found: "Identification") -> str:
     """Model and fits in a line."""
     fit = found.fit_percent
     return (
-        f"{found.model} of order {found.order}, delay {found.delay}, for {found.output}: "
+        f"{found.model} of order {found.order}, delay {delay_text(found)}, for {found.output}: "
         f"free run {fit.free_run:.2f} %, one step {fit.one_step:.2f} %"
     )
+
+
+def delay_text(found: "Identification") -> str:
+    """Delay in rows, of each input where they differ."""
+    delay = found.delay
+    return str(delay) if isinstance(delay, int) else ", ".join(f"{name} {rows}" for name, rows in delay.items())
 
 
 def identification_text(
@@ -41,7 +47,7 @@ def identification_text(
     rows = f"{found.rows} rows fitted{', row by row' if found.recursive else ''}"
     error = "" if found.rmse is None else f" (root mean square error {found.rmse.free_run:.4g})"
     lines = [
-        f"{NAMES[found.model]} of order {found.order}, delay {found.delay}: {found.output} ({unit}) from the "
+        f"{NAMES[found.model]} of order {found.order}, delay {delay_text(found)}: {found.output} ({unit}) from the "
         f"{' and '.join((past, *inputs))}; {rows}",
         "",
         *_parameter_lines(found),

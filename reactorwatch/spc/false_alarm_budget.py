@@ -54,8 +54,8 @@ DAYS = 30
 DAYS_MIN = DAYS * 24 * 60.0
 """The same in minutes."""
 
-USUAL_PER_30_DAYS = 1.0
-"""False alarms of a plant that are promised where the settings ask for no number."""
+USUAL_ROWS = 8640.0
+"""Rows of 5 minutes in 30 days. Slower rows are fewer, and one false alarm in 30 days would be one in 30 daily rows."""
 
 SHORTEST_ARL0 = 10 * SHORTEST_DESIGN
 """Shortest run length of an alarm, in rows: more frequent alarms are no promise."""
@@ -68,11 +68,20 @@ DRAWS, SEED = 400, 20_260_523
 """Draws of the errors of a training, of which the quantile is the 28th largest; always the same ones."""
 
 
+def usual_per_30_days(period_min: float) -> float:
+    """False alarms in 30 days that are promised where nothing is asked: 1, or 1 in `USUAL_ROWS` rows if that is fewer.
+
+    >>> usual_per_30_days(0.1), usual_per_30_days(50.0)
+    (1.0, 0.1)
+    """
+    return min(1.0, DAYS_MIN / period_min / USUAL_ROWS)
+
+
 def promise_per_30_days(asked: float | None, alarms: int, period_min: float) -> float:
     """The false alarms of a plant in 30 days that are promised.
 
     Args:
-        asked: number that the settings ask for; None: `USUAL_PER_30_DAYS`, or the nearest number that charts can keep.
+        asked: number that the settings ask for; None: `usual_per_30_days`, or the fewest that charts can keep.
         alarms: number of alarms that share them.
         period_min: sampling period of the rows.
 
@@ -82,12 +91,12 @@ def promise_per_30_days(asked: float | None, alarms: int, period_min: float) -> 
     rows = DAYS_MIN / period_min * alarms
     fewest, most = rows / LONGEST_DESIGN, rows / SHORTEST_ARL0
     if asked is None:
-        return min(max(USUAL_PER_30_DAYS, fewest), most)
+        return max(usual_per_30_days(period_min), fewest)
     if not fewest <= asked <= most:
         bounds = f"[{_two_digits(fewest, ceil)}, {_two_digits(most, floor)}]"
         raise InputError(
             f"false_alarms_per_30_days must be in {bounds} for {alarms} alarms and rows every {period_min:g} min, got "
-            f"{asked:g}; set it within that range, or leave it out for the nearest number to 1 that can be kept"
+            f"{asked:g}; set it within that range, or leave it out for one that can be kept"
         )
     return asked
 

@@ -273,3 +273,15 @@ def test_a_coefficient_whose_variance_rounding_made_negative_is_not_determined()
         model.shape, model.rows, model.effective, model.gain, scaling, variances, model.theta, covariance
     )
     assert damaged.dynamics_sd == inf
+
+
+def test_held_out_blocks_separate_a_wrong_model_from_a_right_one() -> None:
+    """A quadratic plant is described but for its noise; a plant with jumps of its slope is not, and has no noise."""
+    model, inputs, _ = trained()
+    assert model.error_ratio <= 2.0
+    x, rows = 0.0, []
+    for (u,) in inputs:
+        rows.append([x])
+        x = 0.6 * x + 0.4 * abs(u + x)
+    wrong = fit_black_box(inputs, np.array(rows), following(TRAINING), np.array([1e-9]))
+    assert wrong.error_ratio > 2.0

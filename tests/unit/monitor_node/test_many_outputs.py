@@ -125,13 +125,36 @@ def test_the_default_promise_is_refused_at_no_period_and_the_promise_is_publishe
     watch(monitor, plant(outputs, 200), row_ns=round(period_s * 1e9))
     assert monitor.phase == "watching"
     alarms = 5 * outputs + (outputs > 1)
-    fewest, most = (30 * 86_400 / period_s * alarms / arl0 for arl0 in (1e8, 50.0))
-    promised = min(max(1.0, fewest), most)
+    promised = max(min(1.0, 300.0 / period_s), 30 * 86_400 / period_s * alarms / 1e8)
     assert monitor.memory.watching_since_ns is not None
     days = 200 * period_s / 86_400 - monitor.memory.watching_since_ns / 86_400e9
     assert monitor.pipeline.baselines.expected_false_alarms == pytest.approx(promised * days / 30)
-    told = f"training: {promised:.3g} false alarms in 30 days are promised instead of 1: that is the nearest"
+    told = (
+        f"training: {promised:.3g} false alarms in 30 days are promised instead of 1: that is the nearest"
+        if promised > 1.0
+        else "training: 1 false alarm in 8,640 rows is promised, 1 in "
+    )
     assert [note.startswith(told) for note in monitor.notes] == ([True] if promised != 1.0 else [])
+
+
+@pytest.mark.parametrize("asked", [None, 0.5])
+def test_rows_of_a_day_have_the_charts_of_rows_of_five_minutes_unless_another_number_is_asked(
+    asked: float | None,
+) -> None:
+    values = plant(2, 300)
+    values[0, 250:] += 2.0
+    raised: dict[float, list[int]] = {}
+    for period_s in (300.0, 86_400.0):
+        config = msgspec.structs.replace(config_of(2, 10), training_min=150 * period_s / 60)
+        monitor = Monitor(msgspec.structs.replace(config, false_alarms_per_30_days=asked), 0, points=False)
+        said = watch(monitor, values, row_ns=round(period_s * 1e9))
+        alarms = [item.message for item in said if isinstance(item.message, Alarm)]
+        raised[period_s] = [round(item.time_ns / period_s / 1e9) for item in alarms if item.event == "raised"]
+        assert monitor.promise is not None
+        assert (" rows)" in monitor.promise.text) == (period_s > 300.0)
+    same = raised[300.0] == raised[86_400.0]
+    assert same == (asked is None)
+    assert raised[300.0]
 
 
 def test_a_promise_that_is_asked_for_and_cannot_be_kept_is_refused_with_the_range_and_the_cure() -> None:

@@ -24,12 +24,15 @@ NONE = "none stated: only charts of values watch, or none within its bounds is s
     ("stated", "text"),
     [
         ([power("T.bias", 0.214)], "T.bias 0.21 K"),
-        ([power("T.bias", None)], NONE),
+        ([power("T.bias", None)], "none; within a day: T.bias 0.1 K"),
+        ([], NONE),
         ([power("T.bias", 0.2, "ramp")], NONE),
         ([power("heat_loss", 0.2)], "heat_loss 0.2 K; not stated: causes with states of their own or jumps, as lags"),
     ],
 )
-def test_the_steps_of_an_hour_are_stated_and_that_others_are_not(stated: list[Power], text: str) -> None:
+def test_the_steps_of_an_hour_are_stated_else_those_of_a_day_and_that_others_are_not(
+    stated: list[Power], text: str
+) -> None:
     assert describe_power(stated) == text
 
 
