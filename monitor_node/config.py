@@ -118,7 +118,8 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
             training adjusts them.
         units: unit by signal, as its process describes it: that of samples which name none, and, without equations,
             the unit in which a signal is judged.
-        order: order of the ARX models.
+        order: order of the ARX models; None: 3, and where they judge, that of the least error on rows of the training
+            that the fit has not seen.
         delay: delay of the input in samples; with 1 it acts on the next sample.
         forgetting: forgetting factor of the adaptive model, in [0.5, 1]; with 1 it forgets nothing.
         training_min: duration of the training, in minutes of rows, one sampling period a row; time without rows does
@@ -165,7 +166,7 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
     resolution: dict[str, float] = msgspec.field(default_factory=dict)
     uncertain: dict[str, float] = msgspec.field(default_factory=dict)
     units: dict[str, str] = msgspec.field(default_factory=dict)
-    order: Annotated[int, msgspec.Meta(ge=1, le=20)] = 3
+    order: Annotated[int, msgspec.Meta(ge=1, le=20)] | None = None
     delay: Annotated[int, msgspec.Meta(ge=1, le=100)] = 1
     forgetting: Annotated[float, msgspec.Meta(ge=0.5, le=1.0)] = 0.999
     training_min: Annotated[float, msgspec.Meta(ge=1e-3, le=1e6)] | None = None
