@@ -9,6 +9,7 @@ import msgspec
 
 from reactorwatch.contract.keys import DEFAULT_PLANT, check_plant
 from reactorwatch.description.read import find_process
+from reactorwatch.records.file_format import ResampleRule, parse_resampling
 from reactorwatch.runtime.config import check_bounds
 from reactorwatch.spc.charts.base import Setting, SignalSetting
 from reactorwatch.spc.charts.catalogue import CHARTS, chart
@@ -148,6 +149,8 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
         longest_shelf_min: longest time for which an alarm may be shelved, in minutes of the plant.
         state_file: file of the monitor's full state, for a restart; None: it is not stored.
         state_every_s: storage interval in seconds; after a change of an alarm the state is stored at once.
+        resample: period of the rows that are made of the samples, such as `10 s`, with methods of signals behind it as
+            in `--resample`; None: the rows are those of the samples.
         reorder_rows: number of newer rows that may start before an incomplete row is emitted.
         snapshot_min: interval between published models, in minutes of the plant.
         health_period_s: interval between health messages, in seconds.
@@ -189,6 +192,7 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
     longest_shelf_min: Annotated[float, msgspec.Meta(ge=1e-3, le=1e6)] = 480.0
     state_file: str | None = None
     state_every_s: Annotated[float, msgspec.Meta(ge=0.1, le=3600.0)] = 5.0
+    resample: str | None = None
     reorder_rows: Annotated[int, msgspec.Meta(ge=1, le=1000)] = 8
     silence_periods: Annotated[float, msgspec.Meta(ge=1.5, le=1e6)] = 5.0
     snapshot_min: Annotated[float, msgspec.Meta(ge=1e-3, le=1e6)] = 5.0
@@ -217,6 +221,7 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
                 f"outputs must be at least one signal, and each signal have one role, "
                 f"got inputs {self.inputs} and outputs {self.outputs}{beside}"
             )
+        self.resample_rule  # noqa: B018 # checks it
         check_bounds(MonitorConfig, msgspec.structs.asdict(self))
         msgspec.structs.force_setattr(self, "reference", OLDER_REFERENCES.get(self.reference, self.reference))
         if self.training_min is not None and self.training_rows is not None:
@@ -264,6 +269,16 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
         for signal in self.priorities:
             if signal not in self.outputs:
                 raise ValueError(f"priorities are by output, {self.outputs}, got {signal!r}")
+
+    @property
+    def resample_rule(self) -> ResampleRule | None:
+        """Period and methods of the rows that are made of the samples; None: none are made."""
+        if self.resample is None:
+            return None
+        rule = parse_resampling(self.resample, "resample")
+        if rule.period_s is None:
+            raise ValueError(f"resample must state a period, such as 10 s, got {self.resample!r}")
+        return rule
 
     @property
     def training_length(self) -> TrainingLength:

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 from itertools import compress
+from math import nan
 
 import numpy as np
 
@@ -48,7 +49,8 @@ def _count_alarms(names: Iterable[str], outputs: int, signals: int) -> int:
     kinds = [chart(name) for name in names]
     joint = sum(issubclass(kind, JointChart) for kind in kinds) if outputs > 1 else 0
     of_each = outputs * sum(issubclass(kind, SignalChart) for kind in kinds)
-    return joint + of_each + signals * sum(issubclass(kind, ValueChart) for kind in kinds)
+    of_values = sum(outputs if kind.is_of_outputs else signals for kind in kinds if issubclass(kind, ValueChart))
+    return joint + of_each + of_values
 
 
 class ChartDesign:
@@ -85,12 +87,12 @@ class ChartDesign:
             for name in self.names
             if issubclass(kind := chart(name), JointChart) and (why := kind.obstacle(rows, signals))
         }
-        self.signals, complete = self._complete_values(values)
+        baseline = self.value_baseline(values, nan)
+        self.signals = baseline.names
         obstacles |= {
             name: why
             for name in self.names
-            if issubclass(kind := chart(name), ValueChart)
-            and (why := kind.obstacle(complete, self.signals, self._config.chart_signals))
+            if issubclass(kind := chart(name), ValueChart) and (why := kind.obstacle(baseline))
         }
         charts = [name for name in dict.fromkeys(self._config.charts) if name in self.names and name not in obstacles]
         self.evaluated, self.chosen = evaluated, charts or [name for name in self.names if name not in obstacles]
@@ -118,9 +120,9 @@ class ChartDesign:
 
     def value_baseline(self, values: Array, arl0: float) -> ValueBaseline:
         """Baseline of charts of values; arguments as for `relative_rates`."""
-        return ValueBaseline(
-            *self._complete_values(values), arl0, self._config.chart_settings, self._config.chart_signals
-        )
+        config, (names, complete) = self._config, self._complete_values(values)
+        inputs = sum(name in config.inputs for name in names)
+        return ValueBaseline(names, complete, arl0, config.chart_settings, config.chart_signals, inputs)
 
     def relative_rates(
         self, learned: list[Prewhitening], e: Array, values: Array, arl0: float, errors: TrainingErrors

@@ -2,12 +2,14 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import chain
 from math import isfinite
 
 import msgspec
 
 from monitor_node.config import MonitorConfig
 from monitor_node.ingest.alignment import Aligner, AlignmentMemory, ReplayFilter, Row
+from monitor_node.ingest.resampler import Resampler, ResamplerMemory
 from monitor_node.ingest.sequence_check import HeldSample, SequenceCheck
 from reactorwatch.contract import keys
 from reactorwatch.contract.codec import OTHER_VERSION, DecodeError, Encoded, Publication, decode
@@ -150,6 +152,7 @@ class IntakeMemory(Memory, kw_only=True):
         heard_from_ns: time of the first accepted sample by signal.
         refused: number of rejected messages by reason.
         unusable: samples refused since the newest usable one.
+        resampling: memory of the resampler, if there is one.
     """
 
     runs: list[SequenceCheck]
@@ -157,6 +160,7 @@ class IntakeMemory(Memory, kw_only=True):
     heard_from_ns: dict[str, int] = msgspec.field(default_factory=dict)
     refused: dict[str, int] = msgspec.field(default_factory=dict)
     unusable: UnusableSamples = msgspec.field(default_factory=UnusableSamples)
+    resampling: ResamplerMemory = msgspec.field(default_factory=ResamplerMemory)
 
 
 class SampleIntake:
@@ -192,12 +196,16 @@ class SampleIntake:
         self._units = SampleUnits(config.units, model_units)
         self.rejects = RejectCounter()
         self.aligner = Aligner(config.signals, config.reorder_rows)
+        rule = config.resample_rule
+        self._resampler = None if rule is None else Resampler(rule, config.inputs, config.outputs)
         self._use(memory)
         self._replay_filter: ReplayFilter | None = None
 
     def _use(self, memory: IntakeMemory) -> None:
         self.memory, self.rejects.by_reason = memory, memory.refused
         self.output_units = [memory.units[output] for output in self._config.outputs]
+        if self._resampler is not None:
+            self._resampler.memory = memory.resampling
 
     def resume(self, memory: IntakeMemory, alignment: AlignmentMemory) -> None:
         """Resume from memories, which are those that run then.
@@ -282,7 +290,8 @@ class SampleIntake:
             text = f"{signal} number {number} at {time_ns} ns: no plant counts or lasts so far"
             self.rejects.add("out_of_range", text)
             return False
-        accepted, rejected = run.update(sample, self._config.reorder_rows)
+        may_pause = self._resampler is not None
+        accepted, rejected = run.update(sample, self._config.reorder_rows, may_pause=may_pause)
         for item in rejected:
             self.rejects.add(
                 "out_of_place",
@@ -311,12 +320,19 @@ class SampleIntake:
             memory.units[signal] = unit
             self.output_units = [memory.units[output] for output in self._config.outputs]
         for row in self.aligner.update(signal, time_ns, number, value):
-            self._on_row(row, publications)
+            if self._resampler is None:
+                self._on_row(row, publications)
+            else:
+                for made in self._resampler.update(row):
+                    self._on_row(made, publications)
 
     def finish(self, publications: list[Publication]) -> None:
         """Process held samples and pending rows, as at the end of a record."""
         for signal, run in zip(self._config.signals, self.memory.runs, strict=True):
             for sample in run.release():
                 self._accept(signal, *sample, publications)
-        for row in self.aligner.flush():
+        rows = self.aligner.flush()
+        if self._resampler is not None:
+            rows = [*chain.from_iterable(map(self._resampler.update, rows)), *self._resampler.flush()]
+        for row in rows:
             self._on_row(row, publications)

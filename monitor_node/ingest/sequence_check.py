@@ -83,10 +83,19 @@ class SequenceCheck(GapTracker):
         self.expected, self.newest_ns = number + 1, time_ns
         return True
 
-    def update(self, sample: HeldSample, reorder_rows: int) -> tuple[list[HeldSample], list[HeldSample]]:
-        """Update with a sample; returns accepted samples and rejected samples."""
+    def update(
+        self, sample: HeldSample, reorder_rows: int, *, may_pause: bool = False
+    ) -> tuple[list[HeldSample], list[HeldSample]]:
+        """Update with a sample; returns accepted samples and rejected samples.
+
+        Args:
+            sample: the sample.
+            reorder_rows: see `MonitorConfig`.
+            may_pause: True if the next number follows after any time, as of a signal that is sent when it moves.
+        """
         held, window = self.held, REMEMBERED * reorder_rows
-        follows = self._follows(sample, window)
+        is_next = sample.number == self.expected and sample.time_ns > self.newest_ns
+        follows = (may_pause and is_next) or self._follows(sample, window)
         if not held:
             if follows:
                 self._accept(sample)

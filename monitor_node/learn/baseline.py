@@ -43,6 +43,10 @@ from reactorwatch.spc.step_test import ROWS as STEP_ROWS
 FEWEST_ROWS = 50
 """Least number of residuals; the training continues until there are as many."""
 
+FEWEST_SPARSE = 20
+"""The same for an output with values in less than half of the rows, such as a laboratory's, judged by equations: they
+leave no coefficients to estimate from it, and limits allow for a standard deviation known to a sixth."""
+
 MINOR = 0.2
 """Share of the smallest relevant standard deviation (of the filter: of the residual's) below which a deviation of a few
 times as much does not make an interval disturbed."""
@@ -108,6 +112,11 @@ def fewest_values(config: MonitorConfig, model: ProcessModel | None) -> int:
     return FEWEST_ROWS if model is not None else max(arx_fit.fewest_rows(of_one_input), FEWEST_ROWS)
 
 
+def needed_values(count: int, rows: int, fewest: int, *, by_equations: bool) -> int:
+    """Least number of values or predictions of an output that has some count of them in a training."""
+    return FEWEST_SPARSE if by_equations and count < rows / 2 else fewest
+
+
 def learn_baseline(
     config: MonitorConfig, model: ProcessModel | None, models: ArxReference, rows: TrainingRows, *, last_chance: bool
 ) -> TrainingResult:
@@ -120,12 +129,12 @@ def learn_baseline(
         rows: the rows.
         last_chance: True to use the training even if it is disturbed.
     """
-    choice, outputs = _Choice(config, models, rows), config.outputs
+    choice, outputs = _Choice(config, models, rows, has_model=model is not None), config.outputs
     (time_min, inputs, measured), left_out = choice.rows, choice.left_out
     reference, z, screenings = choice.choose(model)
     if not reference.follows_equations:
         left_out |= _too_few_values(config.inputs, inputs)
-    left_out |= _too_few_residuals(outputs, z, choice.rows, left_out)
+    left_out |= _too_few_residuals(outputs, z, choice.rows, left_out, by_equations=reference.follows_equations)
     evaluated = [name not in left_out for name in outputs]
     refused = _refusal(outputs, screenings, evaluated)
     if not any(evaluated):
@@ -198,7 +207,7 @@ class _Choice:
         without_black_box: reason why there is no black box; empty if there is, or it was not wanted.
     """
 
-    def __init__(self, config: MonitorConfig, models: ArxReference, rows: TrainingRows) -> None:
+    def __init__(self, config: MonitorConfig, models: ArxReference, rows: TrainingRows, *, has_model: bool) -> None:
         self._config, self._models, outputs = config, models, config.outputs
         self.rows = rows.arrays
         columns = list(zip(outputs, self.rows.outputs.T, strict=True))
@@ -206,7 +215,7 @@ class _Choice:
         self.smallest = [
             max(config.smallest_sd.get(name, 0.0), sd, 1e-12) for name, sd in zip(outputs, self.steps, strict=True)
         ]
-        self.left_out = _too_few_values(outputs, self.rows.outputs) | self._constant_outputs()
+        self.left_out = _too_few_values(outputs, self.rows.outputs, by_equations=has_model) | self._constant_outputs()
         self.rows.outputs[:, [name in self.left_out for name in outputs]] = np.nan
         has_values = np.count_nonzero(np.isfinite(self.rows.inputs), axis=0) >= FEWEST_ROWS
         self.given = self.rows._replace(inputs=np.where(has_values, self.rows.inputs, 0.0))
@@ -345,27 +354,37 @@ def _predicts_as_well(candidate: _Candidate, identified: _Candidate) -> bool:
     return True
 
 
-def _too_few_values(names: tuple[str, ...], columns: Array) -> dict[str, str]:
+def _too_few_values(names: tuple[str, ...], columns: Array, *, by_equations: bool = False) -> dict[str, str]:
     """Signals with too few values, with the reason."""
-    counts = np.count_nonzero(np.isfinite(columns), axis=0).tolist()
     return {
-        name: NO_VALUE
-        if not count
-        else f"only {count} of {len(columns)} rows have a value of it, {FEWEST_ROWS} are needed"
-        for name, count in zip(names, counts, strict=True)
-        if count < FEWEST_ROWS
+        name: f"only {count} of {len(columns)} rows have a value of it, {needed} are needed" if count else NO_VALUE
+        for name, count, needed in zip(names, *_counts(columns, by_equations=by_equations), strict=True)
+        if count < needed
     }
 
 
-def _too_few_residuals(outputs: tuple[str, ...], z: Array, rows: RowArrays, left_out: dict[str, str]) -> dict[str, str]:
+def _too_few_residuals(
+    outputs: tuple[str, ...], z: Array, rows: RowArrays, left_out: dict[str, str], *, by_equations: bool
+) -> dict[str, str]:
     """Outputs with values, but too few predictions, with the reason."""
-    counts = np.count_nonzero(np.isfinite(z), axis=0).tolist()
     return {
-        name: f"only {count} of its {len(z)} rows could be predicted, {FEWEST_ROWS} are needed: "
+        name: f"only {count} of its {len(z)} rows could be predicted, {needed} are needed: "
         f"{_prediction_obstacle(rows.time_min, rows.inputs)}"
-        for name, count in zip(outputs, counts, strict=True)
-        if count < FEWEST_ROWS and name not in left_out
+        for name, count, needed in zip(outputs, *_counts(z, by_equations=by_equations), strict=True)
+        if count < needed and name not in left_out
     }
+
+
+def _counts(columns: Array, *, by_equations: bool) -> tuple[list[int], list[int]]:
+    """Numbers of values, and of those that are needed, by the rows from the first value to the last."""
+    found = [np.flatnonzero(np.isfinite(column)) for column in columns.T]
+    counts = [int(at.size) for at in found]
+    spans = [int(at[-1] - at[0]) + 1 if at.size else 0 for at in found]
+    needed = [
+        needed_values(count, rows, FEWEST_ROWS, by_equations=by_equations)
+        for count, rows in zip(counts, spans, strict=True)
+    ]
+    return counts, needed
 
 
 def _prediction_obstacle(time_min: Array, inputs: Array) -> str:
@@ -373,7 +392,8 @@ def _prediction_obstacle(time_min: Array, inputs: Array) -> str:
     follows = regular_intervals(time_min)
     regular = np.count_nonzero(follows)
     if regular < 0.9 * follows.size:
-        return f"do rows come one by one period? {regular} of {follows.size} spacings are within a tenth of the usual"
+        found = f"{regular} of {follows.size} spacings are within a tenth of the usual"
+        return f"do rows come one by one period? {found}; --resample auto, or resample in [monitor], makes them regular"
     known = int(np.count_nonzero(np.isfinite(inputs).all(axis=1)))
     if FEWEST_ROWS <= known < 0.9 * len(inputs):
         return f"{'the input has a value' if inputs.shape[1] == 1 else 'all inputs have values'} in {known} of them"

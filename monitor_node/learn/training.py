@@ -6,13 +6,13 @@ is monitored as well.
 
 from collections.abc import Sequence
 from itertools import compress
-from operator import not_
+from operator import ge, not_
 
 from monitor_node.config import MonitorConfig
 from monitor_node.ingest.alignment import MeasuredRow
 from monitor_node.learn import arx_fit
 from monitor_node.learn.arx import ArxReference
-from monitor_node.learn.baseline import TrainingResult, fewest_values, learn_baseline
+from monitor_node.learn.baseline import TrainingResult, fewest_values, learn_baseline, needed_values
 from monitor_node.learn.training_rows import TrainingRows
 from reactorwatch.errors import UnfitRecordError
 from reactorwatch.process.model import ProcessModel
@@ -82,7 +82,9 @@ class Training:
         counts = self.memory.rows.counts
         if timed_out:
             counts = list(compress(counts, map(not_, timed_out)))
-        return min(counts, default=0) >= self._fewest_values
+        rows, by_equations = len(self.memory.rows.times), self._model is not None
+        fewest = (needed_values(count, rows, self._fewest_values, by_equations=by_equations) for count in counts)
+        return bool(counts) and all(map(ge, counts, fewest))
 
     def start_clock(self, time_ns: int) -> None:
         """Count time from a row, unless an earlier one was first."""

@@ -3,7 +3,7 @@
 A folder is one recording of all the files in it; in a list of files it stands for each of them (`expand_folder`).
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -15,41 +15,48 @@ from reactorwatch.description.read import DEFAULT_CHOICE, ProcessChoice
 from reactorwatch.errors import InputError
 from reactorwatch.records.decode import TABLE_SUFFIXES, check_workbook, is_table, list_files
 from reactorwatch.records.file_format import GUESS, FileFormat
-from reactorwatch.records.record import Record
+from reactorwatch.records.record import Record, join_files
 
 if TYPE_CHECKING:
     from reactorwatch.description.process import Process
 
 
 def record(
-    path: Path,
+    files: Path | Sequence[Path],
     plant: str | None = None,
     columns: dict[str, str] | None = None,
     process: "Process | None" = None,
     stated: FileFormat = GUESS,
 ) -> Record:
-    """Read a file as a record.
+    """Read a file, or several in a row, as a record.
 
     Args:
-        path: a table, an .mcap or a folder of recordings.
+        files: a table, an .mcap or a folder of recordings; or several.
         plant: plant in a recording.
         columns: names of a table's columns, by signal.
         process: process whose signals are read; None: the reactor.
-        stated: statements about the form of a table, beside those of the process.
+        stated: statements about the form of a table, beside those of the process; the rows of a recording may be
+            resampled, too.
 
     Raises:
         InputError: the file is neither a table nor an .mcap, or is malformed.
     """
-    from reactorwatch.description.read import convert_to_process, find_process, read_process_table
+    from reactorwatch.description.read import convert_to_process, find_process, read_process_table, resample_rows
 
-    described = process or find_process()
-    if file_kind(path) == "mcap":
-        from recorder.tools.convert import read_record
+    described, paths = process or find_process(), [files] if isinstance(files, Path) else list(files)
+    if all(file_kind(path) == "table" for path in paths):
+        return read_process_table(paths, described, columns, stated)
+    from recorder.tools.convert import read_record
 
+    parts = []
+    for path in paths:
+        if file_kind(path) == "table":
+            parts.append(read_process_table(path, described, columns, replace(stated, resample=None)))
+            continue
         check_workbook(path, stated.sheet)
         recorded = read_record(path, plant, described)
-        return recorded if process is None else convert_to_process(recorded, process)
-    return read_process_table(path, described, columns, stated)
+        parts.append(recorded if process is None else convert_to_process(recorded, process))
+    return resample_rows(join_files(parts), described, stated)
 
 
 def described_process(path: Path, plant: str | None = None, choice: ProcessChoice = DEFAULT_CHOICE) -> "Process":
@@ -99,7 +106,7 @@ class MessageSource(NamedTuple):
         has_clock: True if the times of the messages are clock times.
         read_as: guesses about the form of a table; empty: none.
         process: process of the messages' plant; None: unknown.
-        measured: the record, of a table.
+        measured: the record, of a table or of resampled rows.
     """
 
     messages: Iterator[Encoded]
@@ -125,7 +132,7 @@ def open_messages(
         path: a table, an .mcap or a folder of recordings.
         plant: plant in a recording.
         columns: names of a table's columns, by signal.
-        stated: statements about the form of a table.
+        stated: statements about the form of a table, and the period to which rows are resampled.
         choice: process of the plant; the default: as recorded, and of a table the reactor.
         for_equations: True to read a table in the units of the equations of the chosen process, if it has any; columns
             of unknown units are taken to be in these.
@@ -133,22 +140,23 @@ def open_messages(
     Raises:
         InputError: as `record`.
     """
-    if file_kind(path) == "table":
-        from reactorwatch.description.read import read_process_table, read_signals
+    from recorder.files.recording import ZERO_NS, Recording, has_clock, zero_from
+
+    of_table = file_kind(path) == "table"
+    if of_table or stated.resample is not None:
         from recorder.tools.player import samples_of
 
-        if for_equations and not choice.is_default:
-            chosen = choice.load()
-            measured = read_process_table(path, chosen, columns, stated)
-            if chosen.model is not None:
-                measured = replace(measured, units={**measured.units, **chosen.model.units})
-        else:  # any rig may be watched without equations under the reactor's names, in units of its own
-            measured = read_signals(path, choice, columns, stated)
+        process = choice.load() if of_table or not choice.is_default else Recording(path).process(plant)
+        shown = process or choice.load()
+        if not for_equations or (of_table and choice.is_default):
+            shown = shown.without_equations()  # any rig may be watched under the reactor's names, in units of its own
+        measured = record(path, plant, columns, shown, stated)
+        if shown.model is not None:
+            measured = replace(measured, units={**measured.units, **shown.model.units})
         publications = samples_of(measured, plant or DEFAULT_PLANT, measured.stored_zero_ns)
         encoded = (encode(item) for item in publications)
         zero_ns, has_clock_time = measured.stored_zero_ns, bool(measured.zero_ns)
-        return MessageSource(encoded, zero_ns, has_clock_time, measured.read_as, choice.load(), measured)
-    from recorder.files.recording import ZERO_NS, Recording, has_clock, zero_from
+        return MessageSource(encoded, zero_ns, has_clock_time, measured.read_as, process, measured)
 
     check_workbook(path, stated.sheet)
     recording = Recording(path)

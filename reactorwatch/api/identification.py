@@ -15,7 +15,7 @@ from reactorwatch.identification.identify import Identification, ModelForm
 from reactorwatch.identification.identify import identify as fit_model
 from reactorwatch.optional import make_frame
 from reactorwatch.records.record import Record
-from reactorwatch.sentences.models import identification_headline
+from reactorwatch.sentences.models import free_run_text, identification_headline
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -25,7 +25,7 @@ class IdentificationResult(Shown[Identification]):
     """An `Identification` with the record that was fitted."""
 
     def __repr__(self) -> str:
-        return f"<{self.model} of order {self.order} for {self.output}: free run {self.fit.free_run:.2f} %>"
+        return f"<{self.model} of order {self.order} for {self.output}: free run {free_run_text(self.result)}>"
 
     def _repr_html_(self) -> str:
         return "".join(

@@ -21,7 +21,7 @@ from reactorwatch.process import DEFAULT_PROCESS, MODELS
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.file_format import FileFormat
-from reactorwatch.records.record import LONGEST_MIN, join_files
+from reactorwatch.records.record import LONGEST_MIN
 from reactorwatch.records.record import Record as MeasuredRecord
 from reactorwatch.records.write import write_frame
 
@@ -170,8 +170,8 @@ def read_record(
         plant: name of the plant in a recording; None: the only one in it.
         columns: names of the columns in a table, by signal, where they differ.
         form: what is not to be guessed about a table: `time`, `time_unit`, `time_format`, `dates`, `zone`, `period`,
-            `missing`, `separator`, `decimal`, `header`, `transposed`, `tag`, `value`, `sheet`, `quality_good`, like the
-            options of the commands.
+            `missing`, `separator`, `decimal`, `header`, `transposed`, `tag`, `value`, `sheet`, `quality_good`
+            and `resample`, like the options of the commands.
 
     Returns:
         The record; `read_as` has the guesses about a table.
@@ -192,14 +192,14 @@ def read_record(
     names = dict(columns or {})
     if hasattr(file, "__arrow_c_stream__") or hasattr(file, "__dataframe__"):
         described = find_process(process or DEFAULT_PROCESS)
-        read = [_read_frame(file, described, names, stated)]
+        read = _read_frame(file, described, names, stated)
     else:
         files = [Path(item) for item in ([file] if isinstance(file, str | Path) else file)]
         described = described_process(files[0], plant) if process is None else find_process(process)
-        read = [read_file(item, plant, names, described, stated) for item in files]
+        read = read_file(files, plant, names, described, stated)
     if process is None and described.name != DEFAULT_PROCESS:
         process = described  # as the recording has it
-    return Record(**measured_fields(join_files(read)), process=process)
+    return Record(**measured_fields(read), process=process)
 
 
 def _read_frame(frame: Any, process: Process, columns: dict[str, str], stated: FileFormat) -> MeasuredRecord:

@@ -35,7 +35,7 @@ from reactorwatch.description.read import ProcessChoice
 from reactorwatch.errors import prefix_errors
 from reactorwatch.process import DEFAULT_PROCESS
 from reactorwatch.process.model import ProcessModel
-from reactorwatch.records.decode import quote_formula
+from reactorwatch.records.decode import is_table, quote_formula
 from reactorwatch.records.record import to_minutes, to_time_ns
 from reactorwatch.records.write import atomic_write
 from reactorwatch.results.backtest import Backtest
@@ -112,7 +112,9 @@ def run_job(job: Job[BacktestOptions]) -> JobResult:
     remarks = [f"read as: {source.read_as}"] if source.read_as else []
     if opened.process is None or model is not None:
         remarks += filter(None, [first.remark(model or DEFAULT.require_model())])
-    rows = None if log is None else RowsOfFile(job.file, _logged_rows(log, source, result.zero_ns), result.zero_ns)
+    own_rows = source.measured is not None and config.resample is None
+    logged = None if log is None else _logged_rows(log, source, result.zero_ns) if own_rows else log.rows
+    rows = None if logged is None else RowsOfFile(job.file, logged, result.zero_ns)
     return JobResult(text, _row(result), remark="; ".join(remarks), not_watched=result.why or "", extra=rows)
 
 
@@ -122,10 +124,12 @@ def _open(file: Path, asked: BacktestOptions, *, learns: bool) -> _Opened:
     settings = msgspec.structs.replace(asked.settings, plant=plant)
     choice = choose_settings(settings, asked.process)
     source = open_messages(file, plant, asked.columns, asked.stated, choice, for_equations=True)
-    rows, messages = _count_rows(source.messages, plant)
-    source = source._replace(messages=messages)
+    rows: int | None = None  # of resampled samples there are other rows
+    if settings.resample is None:
+        rows, messages = _count_rows(source.messages, plant)
+        source = source._replace(messages=messages)
     if choice.is_default:
-        recorded = source.process if source.measured is None else None
+        recorded = None if is_table(file) else source.process
         if recorded is None:
             return _Opened(source, load_process(limit_training(settings, rows)), None, {})
         return _Opened(source, watch_process(settings, recorded, rows), recorded, {})
@@ -150,8 +154,7 @@ def _count_rows(messages: Iterable[Encoded], plant: str) -> tuple[int, Iterator[
 
 
 def _logged_rows(log: RowLog, source: MessageSource, zero_ns: int) -> list[LoggedRow]:
-    if source.measured is None:
-        return log.rows
+    assert source.measured is not None
     return rows_of_file(log.rows, [to_time_ns(minutes, zero_ns) for minutes in source.measured.time_min.tolist()])
 
 

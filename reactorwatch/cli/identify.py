@@ -1,15 +1,19 @@
 """`identify`: fit models of the outputs of a record and format the results."""
 
 from collections.abc import Sequence
+from typing import Any
+
+import msgspec
+import numpy as np
 
 from reactorwatch.cli.display import json_line
 from reactorwatch.description.process import Process
 from reactorwatch.description.read import ProcessChoice, find_process
-from reactorwatch.errors import InputError, describe_unknown
+from reactorwatch.errors import InputError, UnfitRecordError, describe_unknown
 from reactorwatch.identification.data import Dataset
-from reactorwatch.identification.dead_time import resolve_delay
+from reactorwatch.identification.dead_time import DelayChoice, name_delays, resolve_delay
 from reactorwatch.identification.identify import ModelForm, identify
-from reactorwatch.identification.selection import Selection, select
+from reactorwatch.identification.selection import Candidate, Selection, select
 from reactorwatch.process import DEFAULT_PROCESS
 from reactorwatch.records.record import Record
 from reactorwatch.sentences.models import identification_text, notes_text
@@ -56,27 +60,35 @@ def compare(
     measured: Record,
     inputs: Sequence[str],
     outputs: Sequence[str],
-    form: ModelForm,
+    order: int,
+    delay: DelayChoice,
     *,
     as_json: bool,
 ) -> str:
-    """Compare every family at every order up to that of the form, and format the choice for each output."""
-    if form.order < 1:
-        raise InputError(f"order must be at least 1, got {form.order}")
-    orders, texts = range(1, form.order + 1), []
+    """Compare every family at every order up to one, and format the choice for each output.
+
+    With `auto` a delay of 1 is compared with the dead times that are found, where the rows suffice for the search.
+    """
+    if order < 1:
+        raise InputError(f"order must be at least 1, got {order}")
+    orders, texts = range(1, order + 1), []
     for output in outputs:
         data = Dataset.of_record(measured, inputs, output)
         fitted, _ = data.split(data.rows // 2)
         fitted.check_movement()
-        delay = resolve_delay(form.delay, fitted)
-        selection = select(*data.arrays, orders=orders, delay=delay)
+        try:
+            found = resolve_delay(delay, fitted)
+        except UnfitRecordError:
+            found = 1
+        delays = [found] if delay != "auto" or set(np.atleast_1d(found)) == {1} else [1, found]
+        selection = select(*data.arrays, orders=orders, delays=delays)
         text = f"{selection.table()}\n\n{selection.reason}"
         heading = f"{output}\n" if len(outputs) > 1 else ""
-        texts.append(_selection_json(selection, output) if as_json else f"{heading}{text}")
+        texts.append(_selection_json(selection, data) if as_json else f"{heading}{text}")
     return "\n".join(texts) if as_json else "\n\n".join(texts) + notes_text(measured.remarks)
 
 
-def read_delay(text: str) -> int | str | dict[str, int]:
+def read_delay(text: str) -> DelayChoice:
     """Delay of the command line: a number, `auto`, or `u1=3,u2=15`."""
     try:
         if "=" in text:
@@ -87,11 +99,15 @@ def read_delay(text: str) -> int | str | dict[str, int]:
         raise InputError(f"--delay must be a number of samples, auto, or u1=3,u2=15, got {text!r}") from None
 
 
-def _selection_json(selection: Selection, output: str) -> str:
+def _selection_json(selection: Selection, data: Dataset) -> str:
+    def as_item(candidate: Candidate) -> dict[str, Any]:
+        return msgspec.structs.asdict(candidate) | {"delay": name_delays(candidate.delay, data.input_names)}
+
+    chosen = as_item(selection.chosen)
     report = {
-        "output": output,
-        "candidates": selection.candidates,
-        "chosen": {"family": selection.chosen.family, "order": selection.chosen.order} if selection.fits else None,
+        "output": data.output_name,
+        "candidates": [as_item(candidate) for candidate in selection.candidates],
+        "chosen": {name: chosen[name] for name in ("family", "order", "delay")} if selection.fits else None,
         "reason": selection.reason,
     }
     return json_line(report)

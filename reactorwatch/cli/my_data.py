@@ -48,7 +48,7 @@ def info(
 ) -> None:
     """Show the contents of a recording, and missing messages; or how a table is read, and what is in it."""
     from reactorwatch.cli.info import info_object, info_text, table_object, table_text
-    from reactorwatch.description.read import read_signals
+    from reactorwatch.description.read import read_signals, resample_rows
     from reactorwatch.records.decode import check_workbook, is_table
     from reactorwatch.records.read import read_table
     from recorder.tools.inspect import inspect
@@ -58,11 +58,13 @@ def info(
         check_workbook(check_recording(file), table.sheet)
         if is_table(file) and not file.is_dir():
             record = (
-                read_table(file, None, table.file_format)
+                resample_rows(read_table(file, None, table.file_format), None, table.file_format)
                 if choice.is_default
                 else read_signals(file, choice, None, table.file_format)
             )
             text = json_line(table_object(record, file)) if as_json else table_text(record, file)
+        elif table.resample is not None:
+            raise InputError(f"--resample: info shows the recording {file} as it is; export it with --resample")
         else:
             seen = inspect(file)
             if not choice.is_default:
@@ -162,8 +164,12 @@ def identify(
     model: Annotated[str, Option(help="arx, oe, armax, bj (Box-Jenkins), narx or noe (polynomials).")] = "arx",
     order: Annotated[int, Option(help="Lags of the output, each input and the disturbance.")] = 3,
     delay: Annotated[
-        str, Option(help="Samples from a move of an input to its first effect: N, auto (searched), or u1=3,u2=15.")
-    ] = "1",
+        str | None,
+        Option(
+            help="Samples from a move of an input to its first effect: N, auto (searched), or u1=3,u2=15 [1; with "
+            "--compare auto, beside 1]."
+        ),
+    ] = None,
     validate: Annotated[
         Path | None, Option(help="A record to validate on; all of FILE is then fitted [the second half].")
     ] = None,
@@ -191,7 +197,7 @@ def identify(
     form = ModelForm(
         model,
         order,
-        identification.read_delay(delay),
+        identification.read_delay(delay or "1"),
         recursive=recursive,
         forgetting=forgetting,
     )
@@ -208,7 +214,8 @@ def identify(
     remark = "" if equations is None else unit_remark(equations, measured.columns, measured.time_min)
     with task(f"identifying {file.name}"), unfit_lines([file], as_json=as_json), prefix_errors(file):
         if compare:
-            text = identification.compare(measured, described.inputs, outputs, form, as_json=as_json)
+            delays = identification.read_delay(delay or "auto")
+            text = identification.compare(measured, described.inputs, outputs, order, delays, as_json=as_json)
         else:
             text = identification.fit(measured, described.inputs, outputs, form, held_out, settle, as_json=as_json)
     print_report(text, as_json=as_json)

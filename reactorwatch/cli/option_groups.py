@@ -91,6 +91,14 @@ class TableOptions:
             FILE, help="Qualities of usable values, such as 'Good,192', or '*' (repeatable) [words and codes of OPC]."
         ),
     ] = None
+    resample: Annotated[
+        str | None,
+        fold(
+            FILE,
+            help="Make rows of this period, such as '10 s', or auto; methods may follow, for all signals or some: "
+            "auto,last,T=interpolated (mean, last, interpolated, sparse) [the rows of the file].",
+        ),
+    ] = None
 
     @property
     def file_format(self) -> FileFormat:

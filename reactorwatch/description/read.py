@@ -8,7 +8,7 @@ a path.
 """
 
 import runpy
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from functools import partial
@@ -27,7 +27,8 @@ from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.decode import check_workbook, read_regular, wrap_read_errors
 from reactorwatch.records.file_format import GUESS, FileFormat
 from reactorwatch.records.read import MissingColumnError, SignalColumn, read_table
-from reactorwatch.records.record import LARGEST_VALUE, Record
+from reactorwatch.records.record import LARGEST_VALUE, Record, join_files
+from reactorwatch.records.resampling import resample
 from reactorwatch.records.times import STANDARD
 from reactorwatch.units import conversion
 
@@ -275,12 +276,15 @@ def read_extended_model(path: Path) -> ExtendedModel:
 
 
 def read_process_table(
-    path: Path, process: Process, columns: Mapping[str, str] | None = None, stated: FileFormat = GUESS
+    files: Path | Sequence[Path],
+    process: Process,
+    columns: Mapping[str, str] | None = None,
+    stated: FileFormat = GUESS,
 ) -> Record:
-    """Read the signals of a process from a table.
+    """Read the signals of a process from a table, or from several in a row.
 
     Args:
-        path: the file, see `read_table`.
+        files: the file, see `read_table`, or the files.
         process: decides which signals are read, from which columns and in which units; its inputs and outputs must be
             there.
         columns: names of columns with other names, by signal, or by `time_min` or `time_s`. Such a column has the unit
@@ -288,14 +292,23 @@ def read_process_table(
         stated: statements about the file, which override those of the process.
 
     Returns:
-        The record, in the units of the equations; without equations, in those of the signals. A value outside the
-        bounds of its signal is NaN, as if it was not measured; `excluded` has it, and `read_as` their number.
+        The record, in the units of the equations; without equations, in those of the signals; its rows resampled, if
+        that is stated. A value outside the bounds of its signal is NaN, as if it was not measured; `excluded` has it,
+        and `read_as` their number.
 
     Raises:
-        InputError: as `read_table`; or `columns` names no signal of the process.
+        InputError: as `read_table`, `join_files` and `resample`; or `columns` names no signal of the process.
     """
-    check_workbook(path, stated.sheet)  # that of the process is for its workbooks, and it may have other files too
-    names, stated = dict(columns or {}), process.file_format.override(stated)
+    paths = [files] if isinstance(files, Path) else files
+    for path in paths:  # the sheet of the process is for its workbooks, and it may have other files too
+        check_workbook(path, stated.sheet)
+    stated = process.file_format.override(stated)
+    return resample_rows(join_files([_read_table(path, process, columns, stated) for path in paths]), process, stated)
+
+
+def _read_table(path: Path, process: Process, columns: Mapping[str, str] | None, stated: FileFormat) -> Record:
+    """Read one table; see `read_process_table`."""
+    names = dict(columns or {})
     for name, unit in STANDARD.items():
         if name in names:
             stated = replace(stated, time=names.pop(name), time_unit=unit)
@@ -326,13 +339,27 @@ def read_process_table(
     return _to_model_units(_exclude_impossible(measured, process), process)
 
 
+def resample_rows(record: Record, process: Process | None, stated: FileFormat) -> Record:
+    """Resample the rows of a process's record, if that is stated; without a process all signals are outputs.
+
+    Raises:
+        InputError: as `resample`.
+    """
+    rule = stated.resample_rule
+    signals = () if process is None else process.signals
+    return record if rule is None else resample(record, rule, {item.name: item.role for item in signals})
+
+
 def read_signals(
-    path: Path, choice: ProcessChoice, columns: Mapping[str, str] | None = None, stated: FileFormat = GUESS
+    files: Path | Sequence[Path],
+    choice: ProcessChoice,
+    columns: Mapping[str, str] | None = None,
+    stated: FileFormat = GUESS,
 ) -> Record:
-    """Read the signals of a chosen process from a table, in the units of the signals, for use without equations.
+    """Read the signals of a chosen process from tables, in the units of the signals, for use without equations.
 
     Args:
-        path: see `read_process_table`.
+        files: see `read_process_table`.
         choice: the process.
         columns: see `read_process_table`.
         stated: see `read_process_table`.
@@ -340,7 +367,7 @@ def read_signals(
     Raises:
         InputError: as `read_process_table`.
     """
-    return read_process_table(path, choice.load().without_equations(), columns, stated)
+    return read_process_table(files, choice.load().without_equations(), columns, stated)
 
 
 def convert_to_process(record: Record, process: Process) -> Record:

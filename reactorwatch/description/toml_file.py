@@ -42,6 +42,7 @@ class _File(msgspec.Struct, forbid_unknown_fields=True):
     value: _Column | None = None
     sheet: _Column | None = None
     quality_good: tuple[str | int, ...] = ()
+    resample: str | None = None
 
 
 class _Document(msgspec.Struct, forbid_unknown_fields=True):
@@ -67,6 +68,7 @@ _KEYS = {
     "--tag": "[file] tag",
     "--value": "[file] value",
     "--sheet": "[file] sheet",
+    "--resample": "[file] resample",
 }
 """Keys by the options that state the same."""
 

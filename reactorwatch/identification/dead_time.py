@@ -1,27 +1,40 @@
 """Dead time of each input, from a record.
 
-The output is regressed on its own past and on many lags of all inputs together: each input's dead time is the number of
-its first lags that can go, coordinate by coordinate, at the smallest N ln(S/N) + p ln N, with S the sum of squares of
-the prediction error and p the number of parameters (Schwarz, Ann. Statist. 6 (1978) 461). All inputs at once, since
-with feedback, or with inputs that move together, the correlation of one input with the output misleads. Many lags of
-each, since a short model of inputs with different poles makes up for its error by a wrong dead time.
+The output is regressed on its own past and on many lags of all inputs together, since with feedback, or with inputs
+that move together, the correlation of one input with the output misleads. The lags of an input are a response: nothing
+during the dead time, then coefficients that leave zero gradually and decay. As a prior this is a random walk that
+starts at zero behind the dead time, times an exponential (a kernel for impulse responses, as of Pillonetto, Dinuzzo,
+Chen, De Nicolao and Ljung, Automatica 50 (2014) 657). The dead time is the one with the largest marginal likelihood, at
+the best decay and size: where the first rows of a response are below the noise, they follow from those after them.
 """
 
-import numpy as np
-from numpy.typing import NDArray
+from collections.abc import Sequence
+from typing import TypeAlias
 
+import numpy as np
+from scipy.linalg import block_diag
+
+from reactorwatch.arrays import Array
 from reactorwatch.errors import InputError, UnfitRecordError
 from reactorwatch.identification.data import Dataset, rows_of
 from reactorwatch.identification.structure import Delay, Structure
 
 LONGEST = 25  # rows; the studied dead times end at 20, with 5 to spare
-# Noise of measurement makes the equation of the output long: of 240 inputs of random plants, 4 lags missed 5 by more
-# than a row, 15 missed 4 and 30 missed 3, which such a number does not tell apart: what a lag more costs is time.
+LAGS = LONGEST + 10  # the response after the longest dead time, whose rest the output's past describes
+# Noise of measurement makes the equation of the output long; a lag more costs time.
 OUTPUT_LAGS = 15
+DECAYS = (0.6, 0.8, 0.9, 0.95, 0.98)  # of the variance of a response by a row: it lasts for 2 to 50 rows
+SIZES = 10.0 ** np.arange(-8.0, 1.1, 0.5)  # variance of a step of the random walk, at inputs and output of spread 1
+# Twice a difference of log likelihood, odds of 7: where more than half of the dead times are within it of the best, the
+# record determines none, as where an input has no effect that shows, and the model keeps all lags.
+UNDETERMINED = 4.0
+
+DelayChoice: TypeAlias = int | str | dict[str, int]
+"""Delay as it is asked for: a number of samples, `auto`, or one by the name of each input."""
 
 
-def resolve_delay(delay: int | str | dict[str, int], data: Dataset) -> Delay:
-    """Delay of a structure as it was asked for: a number, `auto`, or one by the name of each input.
+def resolve_delay(delay: DelayChoice, data: Dataset) -> Delay:
+    """Delay of a structure.
 
     Raises:
         InputError: an input that the record does not have or that has no delay, or a record that is too short.
@@ -37,6 +50,11 @@ def resolve_delay(delay: int | str | dict[str, int], data: Dataset) -> Delay:
     return find_dead_times(data) if data.input_names else 1
 
 
+def name_delays(delay: Delay, inputs: Sequence[str]) -> int | dict[str, int]:
+    """Delay of a structure in an answer: by the name of each input where they differ."""
+    return delay if isinstance(delay, int) else dict(zip(inputs, delay, strict=True))
+
+
 def find_dead_times(data: Dataset) -> tuple[int, ...]:
     """Dead time of each input in rows, from 1 to 25.
 
@@ -44,34 +62,69 @@ def find_dead_times(data: Dataset) -> tuple[int, ...]:
         InputError: too few complete rows for the regression.
     """
     count = data.inputs.shape[1]
-    lags = LONGEST + 10  # the response after the longest dead time, whose rest the output's past describes
-    structure = Structure(OUTPUT_LAGS, lags, 1, count)
+    data, _ = data.split(min(data.rows, 20_000))  # ten times as many as the studied records: more take memory
+    structure = Structure(OUTPUT_LAGS, LAGS, 1, count)
     rows = rows_of(structure, *data.arrays)
-    regressors, target = rows.regressors, rows.outputs[:, 0]
-    if len(target) <= 2 * structure.parameters:
+    freedom = len(rows.outputs) - structure.parameters
+    if freedom <= structure.parameters:
         raise UnfitRecordError(
             f"the search of dead times needs more than {2 * structure.parameters} complete rows in succession, "
-            f"got {len(target)}: record for longer, or give --delay"
+            f"got {len(rows.outputs)}: record for longer, or give --delay"
         )
-    regressors = regressors - regressors.mean(axis=0)
-    regressors[:, -1] = 1.0
-    size = np.linalg.norm(regressors, axis=0)
-    regressors, target = regressors / np.where(size > 0.0, size, 1.0), target - target.mean()
-    # an input held for long has nearly dependent lags: a ridge of rounding's size
-    gram, moments = regressors.T @ regressors + 1e-11 * np.eye(size.size), regressors.T @ target
-    total = float(target @ target)
-
-    def criterion(delays: NDArray[np.int64]) -> float:
-        of_inputs = np.arange(1, lags + 1)[:, None] >= delays
-        kept = np.concatenate([np.ones(OUTPUT_LAGS, bool), of_inputs.ravel(), [True]])
-        squares = total - moments[kept] @ np.linalg.solve(gram[np.ix_(kept, kept)], moments[kept])
-        return float(target.size * np.log(max(squares, 1e-14 * total)) + kept.sum() * np.log(target.size))
-
-    delays, before = np.ones(count, dtype=np.int64), np.zeros(count, dtype=np.int64)
-    while not np.array_equal(delays, before):  # each pass lowers the criterion, so it ends
+    gram, moments = _regression(rows.regressors, rows.outputs[:, 0], count, freedom)
+    factors = np.array([[_response_factor(delay, decay) for decay in DECAYS] for delay in range(1, LONGEST + 1)])
+    priors = [1e-3**0.5 * factors[0, -2]] * count  # a slow response without dead time, until an input is searched
+    delays, before = [0] * count, [1] * count
+    while delays != before:
         before = delays.copy()
         for i in range(count):
-            others = np.arange(count) != i
-            tried: list[NDArray[np.int64]] = [np.where(others, delays, delay) for delay in range(1, LONGEST + 1)]
-            delays = min(tried, key=criterion)
-    return tuple(int(delay) for delay in delays)
+            delays[i], priors[i] = _best_response(gram, moments, priors, i, factors)
+    return tuple(delays)
+
+
+def _regression(regressors: Array, target: Array, count: int, freedom: int) -> tuple[Array, Array]:
+    """Gram matrix of the lags of the inputs, one input after the other, and their products with the output.
+
+    Both are over the variance of the noise. The past of the output and the offset are projected out, and inputs are
+    scaled to their spread.
+    """
+    past = regressors[:, [*range(OUTPUT_LAGS), -1]]
+    lagged = regressors[:, OUTPUT_LAGS:-1].reshape(len(target), LAGS, count).swapaxes(1, 2)
+    spread = np.std(lagged[:, :, 0], axis=0)[:, None]
+    scaled = (lagged / np.where(spread > 0.0, spread, 1.0)).reshape(len(target), -1)
+    q, _ = np.linalg.qr(past)
+    scaled, target = scaled - q @ (q.T @ scaled), (target - q @ (q.T @ target)) / np.std(target)
+    gram, moments = scaled.T @ scaled, scaled.T @ target
+    # the lags of an input held for long are nearly dependent
+    solution = np.linalg.lstsq(gram, moments, rcond=1e-11)[0]
+    total = float(target @ target)
+    variance = max(total - float(moments @ solution), 1e-10 * total) / freedom
+    return gram / variance, moments / variance
+
+
+def _response_factor(delay: int, decay: float) -> Array:
+    """Factor F of the prior covariance F F' of a response, shape (lags, lags)."""
+    age = np.arange(1, LAGS + 1) - delay + 1.0
+    return np.where(age > 0.0, decay ** (0.5 * age), 0.0)[:, None] * (age[:, None] >= age) * (age > 0.0)
+
+
+def _best_response(gram: Array, moments: Array, priors: list[Array], i: int, factors: Array) -> tuple[int, Array]:
+    """Dead time of an input with the largest marginal likelihood, and its prior, while those of the others stay."""
+    own = slice(i * LAGS, (i + 1) * LAGS)
+    rest = np.delete(np.arange(len(moments)), own)
+    gram_own, moments_own = gram[own, own], moments[own]
+    if rest.size:
+        prior = block_diag(*(prior for j, prior in enumerate(priors) if j != i))
+        cross = prior.T @ gram[rest, own]
+        both = np.column_stack([cross, prior.T @ moments[rest]])
+        solved = np.linalg.solve(prior.T @ gram[np.ix_(rest, rest)] @ prior + np.eye(rest.size), both)
+        gram_own, moments_own = gram_own - cross.T @ solved[:, :-1], moments_own - cross.T @ solved[:, -1]
+    values, vectors = np.linalg.eigh(factors.swapaxes(2, 3) @ gram_own @ factors)
+    values = np.maximum(values, 0.0)[..., None]
+    projected = np.einsum("dakl,dak->dal", vectors, factors.swapaxes(2, 3) @ moments_own)[..., None] ** 2
+    likelihood = np.sum(SIZES * projected / (1.0 + SIZES * values) - np.log1p(SIZES * values), axis=2)
+    by_delay = np.max(likelihood, axis=(1, 2))
+    if np.count_nonzero(by_delay > np.max(by_delay) - UNDETERMINED) > LONGEST // 2:
+        likelihood = likelihood[:1]
+    delay, decay, size = np.unravel_index(np.argmax(likelihood), likelihood.shape)
+    return int(delay) + 1, np.sqrt(SIZES[size]) * factors[delay, decay]

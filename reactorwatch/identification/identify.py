@@ -12,10 +12,10 @@ from reactorwatch.arrays import Array
 from reactorwatch.errors import InputError, UnfitRecordError, describe_unknown
 from reactorwatch.identification.checks import DEFAULT_LAGS, check_record, independence, whiteness
 from reactorwatch.identification.data import Dataset, RunPlan, plan_run, rows_of
-from reactorwatch.identification.dead_time import resolve_delay
+from reactorwatch.identification.dead_time import DelayChoice, find_dead_times, name_delays, resolve_delay
 from reactorwatch.identification.least_squares import SINGULAR_CONDITION, LeastSquares
 from reactorwatch.identification.linear import fit_linear, unscale
-from reactorwatch.identification.linear_model import Kind, LinearModel, fit_percent, simulate
+from reactorwatch.identification.linear_model import Kind, LinearModel, fit_percent, free_run_percent, simulate
 from reactorwatch.identification.polynomial import PolynomialModel, fit_narx, fit_noe, name_product
 from reactorwatch.identification.rls import RecursiveLeastSquares
 from reactorwatch.identification.structure import Scaling, Structure
@@ -56,7 +56,7 @@ class ModelForm:
 
     model: str = "arx"
     order: int = 3
-    delay: int | str | dict[str, int] = 1
+    delay: DelayChoice = 1
     recursive: bool = False
     forgetting: float = 1.0
 
@@ -232,7 +232,9 @@ def identify(
         checks["whiteness"] = _verdict(white, "the residuals are correlated with each other")
         if structure.inputs:
             free = independence(residuals, fitted.inputs, structure.delay, time=fitted.time)
-            checks["independence"] = _verdict(free.minus_log10_p, "the residuals are correlated with past inputs")
+            wrong = "the residuals are correlated with past inputs"
+            checks["independence"] = _verdict(free.minus_log10_p, wrong, partial(_other_dead_time, structure, fitted))
+    checks["stability"] = _stability(structure, fitted)
     predicted, run = model.predict(*held_out.arrays)[:, 0], free_run(model, held_out, settle)
     predicted[:settle] = np.nan
     y = held_out.output[:, 0]
@@ -240,14 +242,12 @@ def identify(
     return Identification(
         model=form.model,
         order=form.order,
-        delay=structure.delay
-        if isinstance(structure.delay, int)
-        else dict(zip(data.input_names, structure.delay, strict=True)),
+        delay=name_delays(structure.delay, data.input_names),
         output=data.output_name,
         rows=fitted.rows,
         recursive=form.recursive,
         sd=Deviations(**deviations),
-        fit_percent=FitPercent(fit_percent(y, predicted), fit_percent(y, run)),
+        fit_percent=FitPercent(fit_percent(y, predicted), free_run_percent(model, y, run)),
         whiteness_minus_log10_p=white,
         checks=checks,
         rmse=Rmse(_rmse(y, predicted), _rmse(y, run)) if validation is not None or settle else None,
@@ -393,10 +393,36 @@ def _rmse(measured: Array, predicted: Array) -> float:
     return float(np.sqrt(np.mean(errors**2))) if errors.size else math.nan
 
 
-def _verdict(minus_log10_p: float, wrong: str) -> str:
+def _verdict(minus_log10_p: float, wrong: str, find_cause: Callable[[], str] = str) -> str:
     if minus_log10_p < WORST_MINUS_LOG10_P:
         return "ok"
-    return f"{wrong}, -log10 p = {minus_log10_p:.1f}: the model leaves something out, and its sd are too small"
+    cause = find_cause() or "the model leaves something out"
+    return f"{wrong}, -log10 p = {minus_log10_p:.1f}: {cause}, and its sd are too small"
+
+
+def _other_dead_time(structure: Structure, data: Dataset) -> str:
+    """Dead times that an ARX model predicts better with than with those of a structure; empty if there are none."""
+    try:
+        found = Structure(structure.output_lags, structure.input_lags, find_dead_times(data), structure.inputs)
+        here, there = (fit_linear("arx", item, *data.arrays).noise_sd for item in (structure, found))
+    except InputError:  # too few rows to search
+        return ""
+    differences = np.abs(np.subtract(found.delays, structure.delays))
+    if there >= here or max(differences) <= 1:  # the search is right to a row
+        return ""
+    if isinstance(found.delay, int):
+        return f"dead time {found.delay} rows, where the model has {structure.delay} (--delay {found.delay})"
+    named = [f"{name}={rows}" for name, rows in zip(data.input_names, found.delays, strict=True)]
+    return f"dead time {' '.join(named)} rows, where the model has others (--delay {','.join(named)})"
+
+
+def _stability(structure: Structure, data: Dataset) -> str:
+    """Check that the plant is stable, by its ARX model, which alone may have a pole outside the unit circle."""
+    try:
+        pole = fit_linear("arx", structure, *data.arrays).instability
+    except InputError as refusal:
+        return f"cannot tell: {refusal}"
+    return f"the plant is unstable: its ARX model has {pole}, and a simulation diverges" if pole else "ok"
 
 
 def _floats(values: Iterable[float]) -> Coefficients:

@@ -68,6 +68,31 @@ class LinearModel:
         """Standard deviations of the parameters, shape (parameters,)."""
         return standard_deviations(self.covariance)
 
+    @property
+    def diverges(self) -> bool:
+        """True if a pole multiplies an error by more than 100 along the rows of the fit."""
+        modulus = self.largest_pole()[0]
+        return modulus > 1.0 and self.rows * np.log(modulus) > np.log(100.0)
+
+    @property
+    def instability(self) -> str:
+        """Pole that shows that the plant is unstable, beyond 3 sd; empty if it is stable for all the rows show."""
+        modulus, sd = self.largest_pole()
+        outside = self.diverges and modulus > 1.0 + 3.0 * sd
+        return f"a pole at {modulus:.4g} +- {sd:.2g}, outside the unit circle" if outside else ""
+
+    def largest_pole(self) -> tuple[float, float]:
+        """Largest modulus of the poles of the plant, and its standard deviation; inf where it is not determined."""
+        lags = self.structure.output_lags
+        polynomial = np.concatenate([[1.0], -self.parameters[:lags]])
+        poles = np.roots(polynomial)
+        pole = poles[np.argmax(np.abs(poles))]
+        modulus, slope = float(np.abs(pole)), np.polyval(np.polyder(polynomial), pole)
+        if modulus == 0.0 or slope == 0.0:
+            return modulus, np.inf
+        gradient = np.real(np.conj(pole) * pole ** np.arange(lags - 1, -1, -1) / slope) / modulus
+        return modulus, float(standard_deviations(self.covariance[:lags, :lags], gradient[None])[0])
+
     def predict(self, inputs: ArrayLike, outputs: ArrayLike, time: ArrayLike | None = None) -> Array:
         """Predict each row one step ahead from the measured rows before it.
 
@@ -126,6 +151,12 @@ def fit_percent(measured: ArrayLike, predicted: ArrayLike) -> float:
     if not np.all(np.isfinite(yhat)):
         return float("-inf")
     return float(100.0 * (1.0 - np.linalg.norm(y - yhat) / np.linalg.norm(y - np.mean(y))))
+
+
+def free_run_percent(model: object, measured: ArrayLike, run: ArrayLike) -> float:
+    """`fit_percent` of a simulation; -inf also if its model multiplies errors along the record and it shows."""
+    percent = fit_percent(measured, run)
+    return -np.inf if percent < 0.0 and isinstance(model, LinearModel) and model.diverges else percent
 
 
 def standard_deviations(

@@ -14,6 +14,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import product
 from typing import Protocol
 
 import msgspec
@@ -23,7 +24,7 @@ from numpy.typing import ArrayLike
 from reactorwatch.arrays import Array
 from reactorwatch.errors import InputError, UnfitRecordError
 from reactorwatch.identification.linear import fit_linear
-from reactorwatch.identification.linear_model import fit_percent
+from reactorwatch.identification.linear_model import LinearModel, fit_percent, free_run_percent
 from reactorwatch.identification.structure import Delay, Structure, as_columns
 
 EQUAL_PERCENT = 0.5  # difference of fits that counts as none
@@ -65,6 +66,7 @@ class Candidate(msgspec.Struct, frozen=True):
         free_run_percent: fit of the simulation on the held-out half; -inf if it diverged.
         bic: BIC on the fitted half; comparable within a family.
         refusal: reason why there is no such model; empty if there is one.
+        delay: delay of the inputs in samples, or of each.
     """
 
     family: str
@@ -74,6 +76,7 @@ class Candidate(msgspec.Struct, frozen=True):
     free_run_percent: float = math.nan
     bic: float = math.nan
     refusal: str = ""
+    delay: Delay = 1
 
 
 @dataclass(frozen=True)
@@ -81,7 +84,7 @@ class Selection:
     """The table and the choice.
 
     Attributes:
-        candidates: candidates in the order of families, then orders.
+        candidates: candidates in the order of delays, families and orders.
         chosen: the chosen candidate.
         model: model of the choice, fitted to the first half.
         reason: one sentence; where no model fits, the cause.
@@ -99,16 +102,20 @@ class Selection:
 
     def table(self) -> str:
         """The candidates as text, the chosen one marked."""
-        lines = ["  family order  parameters  one step %  free run %       BIC"]
-        for candidate in self.candidates:
+        delays = [_delay_text(candidate.delay) for candidate in self.candidates]
+        width = max(map(len, ("delay", *delays))) + 2 if any(delay != "1" for delay in delays) else 0
+        lines = [f"  family order{'delay' if width else '':>{width}}  parameters  one step %  free run %       BIC"]
+        for candidate, delay in zip(self.candidates, delays, strict=True):
             mark = ">" if candidate is self.chosen and self.fits else " "
-            head = f"{mark} {candidate.family:<6} {candidate.order:>5}"
+            head = f"{mark} {candidate.family:<6} {candidate.order:>5}{delay if width else '':>{width}}"
             if candidate.refusal:
                 lines.append(f"{head}  {candidate.refusal}")
             else:
+                percent = candidate.free_run_percent
+                run = "diverges" if percent == -math.inf else f"{percent:.3f}"
                 lines.append(
                     f"{head}  {candidate.parameters:>10}  {candidate.one_step_percent:>10.3f}"
-                    f"  {candidate.free_run_percent:>10.3f}  {candidate.bic:>8.1f}"
+                    f"  {run:>10}  {candidate.bic:>8.1f}"
                 )
         return "\n".join(lines)
 
@@ -119,9 +126,12 @@ def select(
     time: ArrayLike | None = None,
     fits: Mapping[str, Fit] = LINEAR_FITS,
     orders: Sequence[int] = (1, 2, 3),
-    delay: Delay = 1,
+    delays: Sequence[Delay] = (1,),
 ) -> Selection:
-    """Fit every order of every family to the first half of a record, and choose by the second.
+    """Fit every order and delay of every family to the first half of a record, and choose by the second.
+
+    A plant that an ARX model shows to be unstable has no simulation: the ARX model with the smallest BIC is the choice,
+    which does not fit for use.
 
     Args:
         inputs: shape (rows,) or (rows, inputs), NaN where nothing was measured.
@@ -129,7 +139,7 @@ def select(
         time: shape (rows,); None: gaps are not detected.
         fits: fits to compare, by the name of the family.
         orders: orders to compare.
-        delay: delay of the inputs, in samples, or of each.
+        delays: delays of the inputs to compare, each in samples, or of each input.
 
     Raises:
         InputError: no family, an order or delay below 1, or a record that no model can be fitted to.
@@ -141,25 +151,28 @@ def select(
     half = len(y) // 2
     fitted: list[tuple[Candidate, Model]] = []
     candidates: list[Candidate] = []
-    for family, fit in fits.items():
-        for order in orders:
-            structure = Structure.of_order(order, delay, u.shape[1])
-            try:
-                model = fit(structure, u[:half], y[:half], t[:half])
-            except InputError as refusal:
-                candidates.append(Candidate(family, order, refusal=str(refusal)))
-                continue
-            held_out = u[half:], y[half:], t[half:]
-            candidate = Candidate(
-                family,
-                order,
-                model.parameter_count,
-                fit_percent(y[half:, 0], model.predict(*held_out)[:, 0]),
-                fit_percent(y[half:, 0], model.simulate(*held_out)[:, 0]),
-                bic(model.residuals(u[:half], y[:half], t[:half]), model.parameter_count),
-            )
-            candidates.append(candidate)
-            fitted.append((candidate, model))
+    for delay, (family, fit), order in product(delays, fits.items(), orders):
+        structure = Structure.of_order(order, delay, u.shape[1])
+        try:
+            model = fit(structure, u[:half], y[:half], t[:half])
+        except InputError as refusal:
+            candidates.append(Candidate(family, order, refusal=str(refusal), delay=structure.delay))
+            continue
+        held_out = u[half:], y[half:], t[half:]
+        candidate = Candidate(
+            family,
+            order,
+            model.parameter_count,
+            fit_percent(y[half:, 0], model.predict(*held_out)[:, 0]),
+            free_run_percent(model, y[half:, 0], model.simulate(*held_out)[:, 0]),
+            bic(model.residuals(u[:half], y[:half], t[:half]), model.parameter_count),
+            delay=structure.delay,
+        )
+        candidates.append(candidate)
+        fitted.append((candidate, model))
+    unstable = _unstable(candidates, fitted)
+    if unstable is not None:
+        return unstable
     judged = [pair for pair in fitted if math.isfinite(pair[0].free_run_percent)]
     if not judged:
         reasons = "; ".join(f"{c.family} {c.order}: {c.refusal or 'its simulation diverges'}" for c in candidates)
@@ -170,7 +183,7 @@ def select(
     selection = Selection(tuple(candidates), chosen, model, _reason(chosen, best, candidates))
     if selection.fits:
         return selection
-    structure = Structure.of_order(chosen.order, delay, u.shape[1])
+    structure = Structure.of_order(chosen.order, chosen.delay, u.shape[1])
     return replace(
         selection,
         reason=f"no model fits: {describe(best)} runs best on the held-out half, with "
@@ -180,8 +193,29 @@ def select(
 
 
 def describe(candidate: Candidate) -> str:
-    """Family and order of a candidate, for a sentence."""
-    return f"{candidate.family} of order {candidate.order}"
+    """Family, order and delay of a candidate, for a sentence."""
+    delay = _delay_text(candidate.delay)
+    return f"{candidate.family} of order {candidate.order}{'' if delay == '1' else f' (delay {delay})'}"
+
+
+def _delay_text(delay: Delay) -> str:
+    return str(delay) if isinstance(delay, int) else ",".join(map(str, delay))
+
+
+def _unstable(candidates: Sequence[Candidate], fitted: Sequence[tuple[Candidate, Model]]) -> Selection | None:
+    """Choice for an unstable plant; None where the best ARX model shows none, or does not predict."""
+    arx = [(c, model) for c, model in fitted if isinstance(model, LinearModel) and model.kind == "arx"]
+    if not arx:
+        return None
+    best, model = min(arx, key=lambda pair: pair[0].bic)
+    if not (model.instability and best.free_run_percent < 0.0 and best.one_step_percent >= LEAST_PERCENT):
+        return None
+    reason = (
+        f"no model can be simulated, as the plant is unstable: {describe(best)} has {model.instability}, so a "
+        "loop was closed while it was recorded, and a simulation along the recorded input diverges; "
+        f"{describe(best)} has the smallest BIC and predicts the next row with {best.one_step_percent:.1f} %"
+    )
+    return Selection(tuple(candidates), best, model, reason)
 
 
 def bic(residuals: ArrayLike, parameters: int) -> float:

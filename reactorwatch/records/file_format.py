@@ -3,6 +3,7 @@
 import math
 import re
 from dataclasses import dataclass, fields, replace
+from typing import NamedTuple
 
 from reactorwatch.errors import InputError, describe_unknown
 from reactorwatch.limits import limits
@@ -17,6 +18,25 @@ SECONDS = {"ns": 1e-9, "us": 1e-6, "ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.
 TIME_UNITS = (*SECONDS, "iso")
 SEPARATORS = {"comma": ",", "semicolon": ";", "tab": "\t", "\\t": "\t", "blank": " ", "blanks": " ", "pipe": "|"}
 _PERIOD = re.compile(r"(\d+(?:\.\d+)?)\s*([a-z]+)")
+
+AUTO = "auto"
+METHODS = MEAN, LAST, INTERPOLATED, SPARSE = "mean", "last", "interpolated", "sparse"
+"""Values of resampled rows: the mean over a period, the last value up to the row, the line between the values before
+and after it, or the values near the row and none in the other rows."""
+
+
+class ResampleRule(NamedTuple):
+    """Period and methods by which rows are resampled.
+
+    Attributes:
+        period_s: the period in seconds; None: that of the fastest signal.
+        method: method of the signals that are not named; None: by the kind of the signal.
+        methods: method by signal.
+    """
+
+    period_s: float | None
+    method: str | None
+    methods: dict[str, str]
 
 
 @dataclass(frozen=True)
@@ -40,6 +60,8 @@ class FileFormat:
         value: header or number of the column of values in such a table (`--value`).
         sheet: name or number (from 1) of the sheet of a workbook (`--sheet`).
         quality_good: qualities of usable values, alone or with commas between; `*`: all (`--quality-good`).
+        resample: period of the rows that are made of those of the file, such as `10 s`, or `auto`; methods may follow
+            with commas between, for all signals or as signal=method: `10 s,T=interpolated` (`--resample`).
 
     Raises:
         InputError: a value is not one of those listed.
@@ -60,6 +82,7 @@ class FileFormat:
     value: str | None = None
     sheet: str | None = None
     quality_good: tuple[str, ...] = ()
+    resample: str | None = None
 
     def __post_init__(self) -> None:
         limits().check("missing", '--missing: the number of cells that mean "not measured"', len(self.missing))
@@ -79,8 +102,7 @@ class FileFormat:
             object.__setattr__(self, "separator", separator)
             if separator == self.decimal:
                 raise InputError(f"--separator and --decimal must differ, got {separator!r} for both")
-        if self.period is not None:
-            self.period_s  # noqa: B018 # checks it
+        self.period_s, self.resample_rule  # noqa: B018 # check them
         if self.period is not None and (self.value or self.tag not in (None, "none")):
             raise InputError(f"--tag and --value need a time column, got --period {self.period!r}; state --time NAME")
         if self.zone is not None:
@@ -100,17 +122,45 @@ class FileFormat:
     @property
     def period_s(self) -> float | None:
         """Sampling period in seconds; None: the file has a time column."""
-        if self.period is None:
-            return None
-        match = _PERIOD.fullmatch(self.period.strip())
-        seconds = float(match[1]) * SECONDS.get(match[2], math.nan) if match else math.nan
-        if not 0 < seconds < math.inf:
-            raise InputError(f"--period must be a positive number with its unit, such as 4 s, got {self.period!r}")
-        return seconds
+        return None if self.period is None else _parse_period("--period", self.period)
+
+    @property
+    def resample_rule(self) -> ResampleRule | None:
+        """Period and methods of the rows; None: the rows are those of the file."""
+        return None if self.resample is None else parse_resampling(self.resample, "--resample")
 
 
 GUESS = FileFormat()
 """Nothing is stated, all is guessed."""
+
+
+def parse_resampling(text: str, option: str) -> ResampleRule:
+    """Parse a period, or `auto`, with methods behind it.
+
+    Raises:
+        InputError: the period or a method is none; the text begins with the option.
+    """
+    period, *others = (part.strip() for part in text.split(","))
+    method, methods = None, dict[str, str]()
+    for part in others:
+        name, is_named, kind = part.rpartition("=")
+        if kind.strip() not in METHODS:
+            raise InputError(describe_unknown(f"{option}: method", kind.strip(), METHODS))
+        if is_named:
+            methods[name.strip()] = kind.strip()
+        else:
+            method = kind
+    return ResampleRule(None if period == AUTO else _parse_period(option, period), method, methods)
+
+
+def _parse_period(option: str, text: str) -> float:
+    """Seconds of a period."""
+    match = _PERIOD.fullmatch(text.strip())
+    seconds = float(match[1]) * SECONDS.get(match[2], math.nan) if match else math.nan
+    if not 0 < seconds < math.inf:
+        either = ", or auto" if option == "--resample" else ""
+        raise InputError(f"{option} must be a positive number with its unit, such as 4 s{either}, got {text!r}")
+    return seconds
 
 
 def _check_zone(zone: str) -> None:

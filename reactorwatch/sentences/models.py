@@ -1,5 +1,6 @@
 """An identified model and a simulation in words."""
 
+import math
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
@@ -19,11 +20,16 @@ NAMES = {
 
 def identification_headline(found: "Identification") -> str:
     """Model and fits in a line."""
-    fit = found.fit_percent
     return (
         f"{found.model} of order {found.order}, delay {delay_text(found)}, for {found.output}: "
-        f"free run {fit.free_run:.2f} %, one step {fit.one_step:.2f} %"
+        f"free run {free_run_text(found)}, one step {found.fit_percent.one_step:.2f} %"
     )
+
+
+def free_run_text(found: "Identification") -> str:
+    """Fit of the simulation, in per cent."""
+    percent = found.fit_percent.free_run
+    return "diverges" if percent == -math.inf else f"{percent:.2f} %"
 
 
 def delay_text(found: "Identification") -> str:
@@ -53,7 +59,7 @@ def identification_text(
         *_parameter_lines(found),
         "",
         f"fit on {validated_on or 'the other half'}: one step {found.fit_percent.one_step:.2f} %, "
-        f"free run {found.fit_percent.free_run:.2f} %{error}",
+        f"free run {free_run_text(found)}{error}",
         *(f"{name}: {result}" for name, result in found.checks.items()),
     ]
     return "\n".join(lines)

@@ -12,11 +12,11 @@ from reactorwatch.contract import keys
 from reactorwatch.contract.codec import encode
 from reactorwatch.contract.messages_pb2 import Sample
 from reactorwatch.description.process import Process
-from reactorwatch.description.read import DEFAULT_CHOICE, ProcessChoice, convert_to_process, read_signals
+from reactorwatch.description.read import DEFAULT_CHOICE, ProcessChoice, convert_to_process, read_signals, resample_rows
 from reactorwatch.errors import InputError
 from reactorwatch.records.decode import check_workbook, is_table
 from reactorwatch.records.file_format import GUESS, FileFormat
-from reactorwatch.records.record import LONGEST_MIN, MINUTE_NS, Record, join_files, join_runs, to_time_ns
+from reactorwatch.records.record import LONGEST_MIN, MINUTE_NS, Record, join_runs, to_time_ns
 from reactorwatch.records.write import atomic_write, refuse_source, write_table
 from recorder import RecordedMessage
 from recorder.files.recording import (
@@ -68,7 +68,7 @@ def import_csv(
     plant = plant_name(plant, process)
     files = [csv] if isinstance(csv, Path) else list(csv)
     refuse_source(mcap, files)
-    record = join_files([read_signals(file, choice, columns, stated) for file in files])
+    record = read_signals(files, choice, columns, stated)
     metadata = {"plant": plant, "source": record.name}
     zero_ns = record.zero_ns or zero_ns
     if not zero_ns:
@@ -120,11 +120,13 @@ def export_csv(
     check_workbook(mcap, stated.sheet)
     if is_table(mcap) and not mcap.is_dir():
         record = read_signals(mcap, choice, None, stated)
-    elif choice.is_default:
-        record = read_record(mcap, plant)
     else:
-        process = choice.load().without_equations()
-        record = convert_to_process(read_record(mcap, plant, process), process)
+        process = None if choice.is_default else choice.load().without_equations()
+        record = read_record(mcap, plant, process)
+        if process is not None:
+            record = convert_to_process(record, process)
+        if stated.resample is not None:
+            record = resample_rows(record, process or Recording(mcap).process(plant) or choice.load(), stated)
     write_table(csv, record, clock=clock)
     return record
 

@@ -180,6 +180,8 @@ def open_tape(config: ReplayConfig) -> tuple[tuple[str, ...], Callable[[], Itera
             log.warning("plays several runs one after the other", file=config.file, runs=record.describe_runs())
         zero_ns = record.stored_zero_ns
         return (plant,), lambda: filter_time(samples_of(record, plant, zero_ns), *_span_ns(config, zero_ns))
+    if config.table.resample is not None:
+        raise InputError(f"--resample: the recording {path} is replayed as it was received; export it with --resample")
     signals = None if choice.is_default else {signal.name for signal in choice.load().signals}
     recording = Recording(path)
     topics = [topic for topic in recording.sample_topics if signals is None or topic.name in signals]

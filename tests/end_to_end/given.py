@@ -54,6 +54,19 @@ def _later_record(path: Path) -> None:
     _logged_record(path, "2026-10-25T02:00:06+00:00")
 
 
+def _exported_record(path: Path) -> None:
+    """The same as a historian exports it: T each 6 s, qc when it has moved, C from the laboratory each 5 min."""
+    record = simulate_record(PlantConfig(seed=3, faults=(LEAK,)), 1500)
+    moved = np.flatnonzero(np.diff(record.columns["qc"], prepend=0.0))
+    values = [
+        (round(60 * record.time_min[row], 1), tag, record.columns[tag][row])
+        for tag, rows in (("qc", moved.tolist()), ("T", range(1500)), ("C", range(3, 1500, 50)))
+        for row in rows
+    ]
+    lines = ["time_s,tag,value", *(f"{time_s},{tag},{value:.6f}" for time_s, tag, value in sorted(values))]
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
 def _narrow_record(path: Path) -> None:
     """A record whose input hardly moves, so that several causes explain it."""
     config = PlantConfig(seed=4, faults=("coolant_flow:constant:-0.02",), scenario=NARROW)
@@ -130,6 +143,7 @@ GIVEN: dict[str, Callable[[Path], None]] = {
     "plant.csv": _renamed_record,
     "plant.txt": _logged_record,
     "later.txt": _later_record,
+    "export.csv": _exported_record,
     "narrow.csv": _narrow_record,
     "rig.csv": _tank_record,
     "tanks.txt": _three_tanks_record,

@@ -83,6 +83,6 @@ def estimate_discrepancy(residual: Array, smallest_sd: Array) -> Discrepancy:
 def white_noise_sd(measured: Array, discrepancy: Discrepancy) -> Array:
     """Standard deviation of the white noise of each output: from its second differences, or e where that is smaller."""
     second = measured[2:] - 2.0 * measured[1:-1] + measured[:-2]
-    with np.errstate(invalid="ignore"):
-        sd = np.sqrt(np.nanmean(second**2, axis=0) / 6.0)
+    count = np.count_nonzero(np.isfinite(second), axis=0)  # none, where an output has values in some rows only
+    sd = np.where(count, np.sqrt(np.nansum(second**2, axis=0) / (6.0 * np.maximum(count, 1))), np.inf)
     return np.asarray(np.fmin(sd, discrepancy.sd))

@@ -8,6 +8,7 @@ from reactorwatch.spc.charts.cusum import Cusum
 from reactorwatch.spc.charts.cva_residual import CvaResidual
 from reactorwatch.spc.charts.edetector import EDetector
 from reactorwatch.spc.charts.ewma import Ewma
+from reactorwatch.spc.charts.level import Level
 from reactorwatch.spc.charts.mewma import Mewma
 from reactorwatch.spc.charts.multiple_pca import MultiplePca
 from reactorwatch.spc.charts.multiway_pca import MultiwayPca
@@ -29,6 +30,7 @@ CHARTS: tuple[type[Chart], ...] = (
     PcaSpe,
     ResidualSpace,
     CvaResidual,
+    Level,
     Pls,
     MultiplePca,
     MultiwayPca,

@@ -13,8 +13,6 @@ direction, and the average with a long memory sees it. A fit to n rows with q va
 larger by n / (n - q - 2) (the mean of Hotelling's F); held-out rows, which are judged by fewer, are corrected by that.
 """
 
-from collections.abc import Mapping, Sequence
-
 import numpy as np
 
 from reactorwatch.arrays import Array
@@ -72,10 +70,11 @@ class CvaResidual(StatisticsChart):
         return float((1.0 - size / held_out) / (1.0 - size / rows))
 
     @classmethod
-    def obstacle(cls, values: Array, names: Sequence[str], signals: Mapping[str, tuple[str, ...]]) -> str:
+    def obstacle(cls, baseline: ValueBaseline) -> str:
         """See `ValueChart`."""
+        values, names = baseline.values, baseline.names
         needed = 3 * ROWS * len(names)  # three rows for each value of the past
-        if (why := super().obstacle(values, names, signals)) or len(values) >= needed:
+        if (why := super().obstacle(baseline)) or len(values) >= needed:
             return why
         return f"the training has {len(values)} complete rows, {needed} are needed for {len(names)} signals"
 

@@ -9,8 +9,6 @@ three-way data and projection methods, Ann. Rev. Control 27). A row of a batch i
 SPE of its deviations are charted row by row. Blocks that are held out are of whole batches.
 """
 
-from collections.abc import Mapping, Sequence
-
 import numpy as np
 
 from reactorwatch.arrays import Array
@@ -34,11 +32,11 @@ class MultiwayPca(StatisticsChart):
     is_skewed = True
 
     @classmethod
-    def obstacle(cls, values: Array, names: Sequence[str], signals: Mapping[str, tuple[str, ...]]) -> str:
+    def obstacle(cls, baseline: ValueBaseline) -> str:
         """See `ValueChart`."""
-        if why := super().obstacle(values, names, signals):
+        if why := super().obstacle(baseline):
             return why
-        count, needed = len(batch_starts(values[:, list(names).index(signals["multiway_pca_progress"][0])])), 2 * BLOCKS
+        count, needed = len(batch_starts(progress_of(baseline))), 2 * BLOCKS
         few = f"the training has {count} batches, {needed} are needed (the progress falls between batches)"
         return few if count < needed else ""
 

@@ -12,7 +12,6 @@ each divided by its mean. The quality is needed in the training only: later it m
 of components has the least error of prediction on held-out blocks.
 """
 
-from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from typing import NamedTuple, Self
 
@@ -75,11 +74,11 @@ class Pls(StatisticsChart):
     fewest_signals = 3
 
     @classmethod
-    def obstacle(cls, values: Array, names: Sequence[str], signals: Mapping[str, tuple[str, ...]]) -> str:
+    def obstacle(cls, baseline: ValueBaseline) -> str:
         """See `ValueChart`."""
-        count = len(names) - len(signals["pls_quality"])
+        count = len(baseline.names) - len(baseline.signals["pls_quality"])
         few = f"it needs two signals or more beside the quality variables, got {count}" if count < 2 else ""
-        return super().obstacle(values, names, signals) or few
+        return super().obstacle(baseline) or few
 
     @classmethod
     def fit(cls, values: Array, baseline: ValueBaseline) -> Model:

@@ -30,6 +30,7 @@ from reactorwatch.spc.charts.base import ROWS_A_SIGNAL, Chart, Judgement, vector
 from reactorwatch.spc.charts.ewma import ewma_limit
 from reactorwatch.spc.false_alarm_budget import TrainingErrors, degrees_of_freedom, student_tail
 from reactorwatch.spc.prewhitening import Prewhitening, learn
+from reactorwatch.spc.slow_levels import averages_from_zero
 from reactorwatch.stored_state import Memory
 
 BLOCKS = 5
@@ -48,6 +49,7 @@ class ValueBaseline(NamedTuple):
         arl0: run length of the alarm of a single signal without a fault, in rows.
         settings: settings of the charts, by key.
         signals: signals that the settings name for charts, by key.
+        inputs: number of inputs, which come first.
     """
 
     names: tuple[str, ...]
@@ -55,20 +57,23 @@ class ValueBaseline(NamedTuple):
     arl0: float
     settings: Mapping[str, float]
     signals: Mapping[str, tuple[str, ...]] = MappingProxyType({})
+    inputs: int = 0
 
 
 class ValueChart(Chart):
     """A chart of the values of all signals; a sample is a vector.
 
-    It has the false alarms of one alarm for each of its signals.
+    It has the false alarms of one alarm for each of its signals, or for each output.
 
     Attributes:
-        names: names of its signals, in the order of a sample.
+        names: names of its signals, in the order of a sample, the inputs first.
+        is_of_outputs: whether it judges the outputs only.
         locates: whether the first signals of its explanation are those at which a disturbance may enter.
         fewest_signals: least number of its signals.
     """
 
     names: tuple[str, ...]
+    is_of_outputs: ClassVar[bool] = False
     locates: ClassVar[bool] = False
     fewest_signals: ClassVar[int] = 8  # with fewer the others say too little of each one
 
@@ -91,14 +96,9 @@ class ValueChart(Chart):
         """The text of an alarm at the newest sample, and each signal's share of it, the largest first."""
 
     @classmethod
-    def obstacle(cls, values: Array, names: Sequence[str], signals: Mapping[str, tuple[str, ...]]) -> str:
-        """The reason why there can be no chart after a training; empty if there can.
-
-        Args:
-            values: rows in which no signal is missing, shape (rows, signals); each varies.
-            names: names of the signals.
-            signals: see `ValueBaseline`.
-        """
+    def obstacle(cls, baseline: ValueBaseline) -> str:
+        """The reason why there can be no chart after a training, whose `arl0` is not known yet; empty if there can."""
+        values, names, signals = baseline.values, baseline.names, baseline.signals
         for item in cls.settings:
             lost = [name for name in signals.get(item.key, ()) if name not in names]
             if lost:
@@ -169,10 +169,7 @@ def average_rows(residuals: Array, weight: float) -> Array:
         residuals: held-out residuals, shape (rows, p).
         weight: lambda.
     """
-    averages, average = np.empty_like(residuals), np.zeros(residuals.shape[1])
-    for row, residual in enumerate(residuals):
-        averages[row] = average = average + weight * (residual - average)
-    return averages[min(int(2.0 / weight), len(averages) // 2) :]
+    return averages_from_zero(residuals, weight)[min(int(2.0 / weight), len(residuals) // 2) :]
 
 
 # --- averages of statistics ------------------------------------------------------------------------------------

@@ -69,9 +69,9 @@ def test_row_by_row_gives_what_all_rows_at_once_give(measured: Record) -> None:
 
 
 def test_compare_names_the_chosen_model_and_the_reason(measured: Record) -> None:
-    text = identify.compare(measured, ("qc",), ("C",), TWO, as_json=False)
+    text = identify.compare(measured, ("qc",), ("C",), 2, 1, as_json=False)
     assert text.splitlines()[-1].endswith(".")
-    said = json.loads(identify.compare(measured, ("qc",), ("C",), TWO, as_json=True))
+    said = json.loads(identify.compare(measured, ("qc",), ("C",), 2, 1, as_json=True))
     assert {(item["family"], item["order"]) for item in said["candidates"]} == {
         ("arx", 1), ("arx", 2), ("oe", 1), ("oe", 2),
     }  # fmt: skip

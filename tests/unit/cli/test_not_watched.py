@@ -83,7 +83,7 @@ NOTHING_TO_DIAGNOSE: dict[str, tuple[Columns, tuple[str, ...], str]] = {
     "one row": (reactor(1), (), "needs at least 200 rows, got 1"),
     "too few rows": (reactor(150), (), "needs at least 200 rows, got 150"),
     "an output that is flat": (reactor(T=438.5), (), "T must vary"),
-    "an output without a value": (reactor(C=float("nan")), (), "C needs at least 100 values, got 0"),
+    "an output without a value": (reactor(C=float("nan")), (), "C needs at least 20 values, got 0"),
     "an input that never moves": (reactor(qc=100.0), (), "qc must move"),
     "a process without equations": (signals(), ("--process", "plain.toml"), "must have equations"),
 }

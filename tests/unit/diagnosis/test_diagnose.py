@@ -115,7 +115,7 @@ def changed(record: Record, **columns: Array) -> Record:
         (lambda r: changed(r, T=np.full(r.rows, 440.0)), "T must vary"),
         (lambda r: changed(r, T=r.columns["T"] - 273.15), "degrees C"),
         (lambda r: changed(r, qc=np.full(r.rows, 100.0)), "qc must move"),
-        (lambda r: changed(r, C=np.full(r.rows, np.nan)), "C needs at least 100 values"),
+        (lambda r: changed(r, C=np.full(r.rows, np.nan)), "C needs at least 20 values"),
         (lambda r: Record(r.time_min, {"qc": r.columns["qc"], "T": r.columns["T"]}, r.name), "C is not there"),
     ],
 )

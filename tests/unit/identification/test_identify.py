@@ -153,7 +153,7 @@ def test_without_inputs_it_is_an_autoregression() -> None:
     assert found.b == found.sd.b == ()
     recursive = identify_data(data, ModelForm("arx", order=2, recursive=True))
     np.testing.assert_allclose(recursive.a, found.a, rtol=1e-6)
-    assert set(found.checks) == {"variation", "conditioning", "amplitude", "whiteness"}
+    assert set(found.checks) == {"variation", "conditioning", "amplitude", "whiteness", "stability"}
 
 
 def test_a_decay_without_inputs_is_an_output_error_model() -> None:

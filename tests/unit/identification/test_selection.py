@@ -124,6 +124,37 @@ def test_where_no_model_fits_it_recommends_none_and_reports_the_reason(case: str
     assert not any(line.startswith(">") for line in selection.table().splitlines())
 
 
+def closed_loop(pole: float) -> tuple[Array, Array]:
+    """Input and output of y[k] = pole y[k-1] + 0.5 u[k-1] + e[k] under a controller with moving setpoint."""
+    rng = np.random.default_rng(4)
+    setpoint, e = np.repeat(rng.standard_normal(100), 20), 0.05 * rng.standard_normal((2, 2000))
+    u, y = np.zeros(2000), np.zeros(2000)
+    for k in range(1, 2000):
+        y[k] = pole * y[k - 1] + 0.5 * u[k - 1] + e[0, k]
+        u[k] = 2.0 * (pole - 0.6) * (setpoint[k] - y[k]) + e[1, k]
+    return u, y
+
+
+@pytest.mark.parametrize(("pole", "is_unstable"), [(0.97, False), (1.0, False), (1.02, True), (1.2, True)])
+def test_a_plant_that_only_a_closed_loop_holds_is_named_unstable(pole: float, is_unstable: bool) -> None:
+    selection = select(*closed_loop(pole))
+    assert ("the plant is unstable" in selection.reason) is is_unstable
+    if is_unstable:
+        named = re.search(r"arx of order 1 has a pole at ([\d.]+) .* outside the unit circle", selection.reason)
+        assert named is not None
+        assert float(named[1]) == pytest.approx(pole, abs=0.005)
+        assert "diverges" in selection.table()
+        assert not selection.fits
+
+
+def test_delays_are_compared_beside_orders(noisy_plant: NoisyPlant) -> None:
+    later = np.concatenate([np.zeros(9), noisy_plant.measured[:-9]])
+    selection = select(noisy_plant.inputs, later, delays=(1, 10))
+    assert selection.chosen.delay == 10
+    assert "oe of order 2 (delay 10)" in selection.reason
+    assert "delay" in selection.table().splitlines()[0]
+
+
 def test_a_model_that_fits_is_still_recommended_where_the_halves_differ_a_little(noisy_plant: NoisyPlant) -> None:
     y = noisy_plant.measured + 0.3 * (np.arange(noisy_plant.measured.size) > 2000)
     selection = select(noisy_plant.inputs, y)

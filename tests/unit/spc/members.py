@@ -12,6 +12,7 @@ from reactorwatch.spc.charts.cusum import Cusum, cusum_run_length
 from reactorwatch.spc.charts.cva_residual import CvaResidual
 from reactorwatch.spc.charts.edetector import EDetector
 from reactorwatch.spc.charts.ewma import Ewma, ewma_run_length
+from reactorwatch.spc.charts.level import Level
 from reactorwatch.spc.charts.mewma import Mewma, mewma_run_length
 from reactorwatch.spc.charts.multiple_pca import MultiplePca
 from reactorwatch.spc.charts.multiway_pca import STAGES, MultiwayPca
@@ -113,6 +114,11 @@ MEMBERS: dict[type, Member] = {
         lambda: Ewma(MEAN, SIGMA, 0.1, 2.8, exact_limits=True),
         value,
         ewma_run_length(SHIFT, 0.1, 2.8, exact_limits=True),
+    ),
+    Level: Member(  # of one output, as an average alone
+        lambda: Level(["T"], [MEAN], [SIGMA * sqrt(0.1 / 1.9)], weight=0.1, limit=2.8),
+        lambda rng, rows: value(rng, rows)[:, None],
+        ewma_run_length(SHIFT, 0.1, 2.8),
     ),
     T2: Member(lambda: T2(MEANS, COVARIANCE, 10.0), vector, t2_run_length(SHIFT, 3, 10.0)),
     Mewma: Member(lambda: Mewma(MEANS, COVARIANCE, 0.2, 11.0), vector, mewma_run_length(SHIFT, 3, 0.2, 11.0)),

@@ -298,6 +298,6 @@ def test_held_out_blocks_are_of_whole_batches_and_few_batches_are_refused() -> N
     edges = MultiwayPca.edges(baseline)
     assert len(edges) == 6
     assert set(edges[:-1]) <= set(starts)
-    assert MultiwayPca.obstacle(values, baseline.names, SIGNALS) == ""
-    few = MultiwayPca.obstacle(values[: starts[6]], baseline.names, SIGNALS)
+    assert MultiwayPca.obstacle(baseline) == ""
+    few = MultiwayPca.obstacle(baseline_of(values[: starts[6]]))
     assert few == "the training has 6 batches, 10 are needed (the progress falls between batches)"

@@ -88,12 +88,14 @@ def stopped_at(
 
 
 @pytest.mark.parametrize("points", [True, False], ids=["with points", "without"])
-@pytest.mark.parametrize("reference", ["process", "black-box", "arx"])
+@pytest.mark.parametrize(
+    ("reference", "resample"), [("process", None), ("process", "9 s,C=last"), ("black-box", None), ("arx", None)]
+)
 def test_a_monitor_stopped_at_any_samples_publishes_the_same(
-    reference: Literal["process", "black-box", "arx"], points: bool, leak: list[Encoded]
+    reference: Literal["process", "black-box", "arx"], resample: str | None, points: bool, leak: list[Encoded]
 ) -> None:
     """In training and watching, in an alarm, acknowledged and shelved, in the middle of a row."""
-    config = msgspec.structs.replace(CONFIG, reference=reference)
+    config = msgspec.structs.replace(CONFIG, reference=reference, resample=resample)
     whole = run(Monitor(config, 0, points=points), leak, 0, len(leak))
     places = [*sorted(random.Random(reference).sample(range(len(leak)), 12)), 2505, 2520, 2550]
     again = stopped_at(sorted(places), leak, config, points=points)
