@@ -65,7 +65,7 @@ def fit_models(models: ArxReference, rows: RowArrays, *, to_judge: bool = False)
 def _fit_model(models: ArxReference, index: int, rows: RowArrays, to_judge: bool) -> Array:
     """Fit the model of an output; returns its residuals, shape (n,)."""
     model, outputs, residual = models.predictors[index], rows.outputs[:, index], np.full(rows.time_min.size, nan)
-    structure = _best_structure(model, judging_structures(models.config), rows, outputs) if to_judge else None
+    structure = _best_structure(judging_structures(models.config), rows, outputs) if to_judge else None
     structure = structure or _fitting_structure(models.structure, rows, outputs)
     if structure is not None and structure != model.structure:
         model = _learn_again(models, index, structure, rows)
@@ -96,26 +96,26 @@ def _fit_model(models: ArxReference, index: int, rows: RowArrays, to_judge: bool
     return residual
 
 
-def _best_structure(
-    model: ArxPredictor, structures: Sequence[Structure], rows: RowArrays, outputs: Array
-) -> Structure | None:
+def _best_structure(structures: Sequence[Structure], rows: RowArrays, outputs: Array) -> Structure | None:
     """Structure with the least error on held-out blocks, of those for which the rows suffice; None: of none."""
-    if model.scaling is None or len(structures) == 1:
+    if len(structures) == 1:
         return None
-    inputs, y = model.scaling.inputs(rows.inputs), model.scaling.outputs(outputs[:, None])
     fitting, errors = [], []
     for structure in structures:
-        scaled = _consecutive_rows(structure, rows.time_min, inputs, y)
-        if len(scaled.outputs) >= ROWS_A_PARAMETER * structure.parameters:
-            error = np.full(rows.time_min.size, nan)
-            error[scaled.position] = held_out_residuals(scaled.regressors, scaled.outputs[:, 0])[0]
-            fitting.append(structure)
-            errors.append(error**2)
+        found = _consecutive_rows(structure, rows.time_min, rows.inputs, outputs[:, None])
+        if len(found.outputs) < ROWS_A_PARAMETER * structure.parameters:
+            continue
+        sizes = np.maximum(found.regressors.std(axis=0), 1e-12)
+        scaled = (found.regressors - found.regressors.mean(axis=0)) / sizes
+        scaled[:, -1] = 1.0
+        error = np.full(rows.time_min.size, nan)
+        error[found.position] = held_out_residuals(scaled, found.outputs[:, 0] - found.outputs.mean())[0]
+        fitting.append(structure)
+        errors.append(error**2)
     if not fitting:
         return None
     columns = np.column_stack(errors)
-    means = columns[np.isfinite(columns).all(axis=1)].mean(axis=0)
-    return fitting[int(np.argmin(means))]
+    return fitting[int(np.argmin(columns[np.isfinite(columns).all(axis=1)].mean(axis=0)))]
 
 
 def held_out_residuals(regressors: Array, y: Array) -> tuple[Array, Array]:
