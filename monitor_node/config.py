@@ -9,7 +9,7 @@ import msgspec
 
 from reactorwatch.contract.keys import DEFAULT_PLANT, check_plant
 from reactorwatch.description.read import find_process
-from reactorwatch.records.file_format import ResampleRule, parse_resampling
+from reactorwatch.records.file_format import INTERPOLATED, ResampleRule, parse_resampling
 from reactorwatch.runtime.config import check_bounds
 from reactorwatch.spc.charts.base import Setting, SignalSetting
 from reactorwatch.spc.charts.catalogue import CHARTS, chart
@@ -121,7 +121,8 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
             the unit in which a signal is judged.
         order: order of the ARX models; None: 3, and where they judge, that of the least error on rows of the training
             that the fit has not seen.
-        delay: delay of the input in samples; with 1 it acts on the next sample.
+        delay: delay of the inputs in rows, of all or by input; with 1 they act on the next row. None: 1, unless
+            residuals of the training show a dead time.
         forgetting: forgetting factor of the adaptive model, in [0.5, 1]; with 1 it forgets nothing.
         training_min: duration of the training, in minutes of rows, one sampling period a row; time without rows does
             not count. None: see `training_length`.
@@ -170,7 +171,7 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
     uncertain: dict[str, float] = msgspec.field(default_factory=dict)
     units: dict[str, str] = msgspec.field(default_factory=dict)
     order: Annotated[int, msgspec.Meta(ge=1, le=20)] | None = None
-    delay: Annotated[int, msgspec.Meta(ge=1, le=100)] = 1
+    delay: Annotated[int, msgspec.Meta(ge=1, le=100)] | dict[str, int] | None = None
     forgetting: Annotated[float, msgspec.Meta(ge=0.5, le=1.0)] = 0.999
     training_min: Annotated[float, msgspec.Meta(ge=1e-3, le=1e6)] | None = None
     training_rows: Annotated[int, msgspec.Meta(ge=1, le=10_000)] | None = None
@@ -239,6 +240,9 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
         if self.process is not None and self.outputs == DEFAULT_SIGNALS["outputs"]:
             return  # the outputs are those of the process, which `watched_process` sets
         self._check_chart_signals()
+        for signal in () if self.resample_rule is None else self.resample_rule.methods:
+            if signal not in self.signals:
+                raise ValueError(f"resample has methods of inputs and outputs, {self.signals}, got {signal!r}")
         for signal in self.startup_modes:
             if signal not in self.modes:
                 raise ValueError(f"startup_modes are by mode, {self.modes}, got {signal!r}")
@@ -253,6 +257,10 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
         for parameter, sd in self.uncertain.items():
             if not 0.0 < sd < inf:
                 raise ValueError(f"uncertain: the standard deviation of {parameter} must be positive, got {sd:g}")
+        if isinstance(self.delay, dict) and (
+            set(self.delay) != set(self.inputs) or not all(1 <= rows <= 100 for rows in self.delay.values())
+        ):
+            raise ValueError(f"delay must be 1 to 100 rows of each input, {self.inputs}, got {self.delay}")
         for signal, step in self.resolution.items():
             if signal not in self.outputs:
                 raise ValueError(f"resolution is by output, {self.outputs}, got {signal!r}")
@@ -278,6 +286,10 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
         rule = parse_resampling(self.resample, "resample")
         if rule.period_s is None:
             raise ValueError(f"resample must state a period, such as 10 s, got {self.resample!r}")
+        if INTERPOLATED in (rule.method, *rule.methods.values()):
+            raise ValueError(
+                f"resample cannot interpolate to a value that has not come, got {self.resample!r}; use last"
+            )
         return rule
 
     @property

@@ -12,7 +12,7 @@ Samples are aligned by sample times alone, so that a replay reproduces the live 
 - A row is emitted when it is complete and no older row is pending. Pending are incomplete rows, and rows that are
   missing by their sequence numbers.
 - A row is pending until `reorder_rows` newer rows have started. Then it is emitted with NaN for missing values, and
-  counted as incomplete.
+  counted as incomplete. A row that lacks only signals which most rows lack, as a laboratory's, waits for one newer row.
 - A sample of an emitted row is late: counted and dropped. The same sample twice is a duplicate, counted and dropped.
 - A sample older than the newest of its signal is out of order: counted, and used if its row is pending.
 - A forward jump of sequence numbers means lost samples, until they arrive. A step back by more than reordering can
@@ -274,16 +274,21 @@ REMEMBERED = 4  # times the reordering: emitted rows kept to detect duplicates; 
 class Aligner:
     """Aligns samples to rows.
 
+    Args:
+        signals: names of the signals.
+        reorder_rows: number of newer rows that may start before an incomplete row is emitted.
+        awaits_all: True to wait so long for signals that most rows lack, too, as where each sample is a row of its own.
+
     Raises:
         ValueError: `reorder_rows` is less than 1.
     """
 
-    def __init__(self, signals: tuple[str, ...], reorder_rows: int) -> None:
+    def __init__(self, signals: tuple[str, ...], reorder_rows: int, *, awaits_all: bool = False) -> None:
         if reorder_rows < 1:
             raise ValueError(f"reorder_rows must be at least 1, got {reorder_rows}")
         self._index = {signal: index for index, signal in enumerate(signals)}
         self._count = len(signals)
-        self._reorder_rows = reorder_rows
+        self._reorder_rows, self._awaits_all = reorder_rows, awaits_all
         self.memory = AlignmentMemory()
         self._start_run()
 
@@ -303,6 +308,8 @@ class Aligner:
         if waiting is None:
             if memory.newest_emitted_ns is not None and time_ns <= memory.newest_emitted_ns:
                 memory.counts.late += 1
+                if (numbers := memory.emitted.get(time_ns)) is not None:
+                    numbers[index] = sequence  # the signal is not one that the row lacked
                 return rows
             count = self._count
             waiting = pending[time_ns] = PendingRow([nan] * count, [None] * count, count)
@@ -325,19 +332,27 @@ class Aligner:
         times = sorted(pending)
         for position, time_ns in enumerate(times):
             newer = len(times) - 1 - position
-            if newer < self._reorder_rows and not self._is_ready(pending[time_ns]):
+            if newer < self._reorder_rows and not self._is_ready(pending[time_ns], has_newer=newer > 0):
                 break
             rows.append(self._emit(time_ns))
         return rows
 
-    def _is_ready(self, waiting: PendingRow) -> bool:
+    def _is_ready(self, waiting: PendingRow, *, has_newer: bool = False) -> bool:
         """True if a row is complete, and follows the row emitted last by any of its sequence numbers."""
-        if waiting.missing:
+        if waiting.missing and not (has_newer and self._lacks_sparse_signals_only(waiting)):
             return False
         for before, number in zip(self.memory.newest_numbers, waiting.numbers, strict=True):
             if before is None or number == before + 1:
                 return True
         return False
+
+    def _lacks_sparse_signals_only(self, waiting: PendingRow) -> bool:
+        """True if most of the rows emitted last lack each signal that a row lacks, and it did not come late either."""
+        emitted = list(self.memory.emitted.values())
+        if self._awaits_all or len(emitted) < REMEMBERED * self._reorder_rows:
+            return False
+        lacking = [2 * sum(row[index] is None for row in emitted) > len(emitted) for index in range(self._count)]
+        return all(is_sparse for is_sparse, number in zip(lacking, waiting.numbers, strict=True) if number is None)
 
     def _emit(self, time_ns: int) -> Row:
         memory = self.memory

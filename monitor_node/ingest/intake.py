@@ -195,8 +195,8 @@ class SampleIntake:
         self._indices = {signal: index for index, signal in enumerate(config.signals)}
         self._units = SampleUnits(config.units, model_units)
         self.rejects = RejectCounter()
-        self.aligner = Aligner(config.signals, config.reorder_rows)
         rule = config.resample_rule
+        self.aligner = Aligner(config.signals, config.reorder_rows, awaits_all=rule is not None)
         self._resampler = None if rule is None else Resampler(rule, config.inputs, config.outputs)
         self._use(memory)
         self._replay_filter: ReplayFilter | None = None

@@ -57,7 +57,8 @@ long, and so do dead times, and the largest order of the settings is as long as 
 
 def arx_structure(config: MonitorConfig) -> Structure:
     """Structure of the identified models that the settings ask for, or the usual one."""
-    return Structure.of_order(config.order or 3, config.delay, inputs=len(config.inputs))
+    delay = tuple(config.delay[name] for name in config.inputs) if isinstance(config.delay, dict) else config.delay
+    return Structure.of_order(config.order or 3, delay or 1, inputs=len(config.inputs))
 
 
 def judging_structures(config: MonitorConfig) -> list[Structure]:
@@ -65,7 +66,7 @@ def judging_structures(config: MonitorConfig) -> list[Structure]:
     usual = arx_structure(config)
     if config.order is not None or config.has_values_only:
         return [usual]
-    others = [Structure.of_order(order, config.delay, usual.inputs) for order in ORDERS]
+    others = [Structure.of_order(order, usual.delay, usual.inputs) for order in ORDERS]
     return sorted([usual, *others], key=lambda item: -item.parameters)
 
 
@@ -351,7 +352,9 @@ class ArxReference(Reference):
         """
         known = (*judging_structures(self.config), *simpler_structures(self.structure))
         for predictor in predictors:
-            if predictor.structure not in known:
+            found = predictor.structure
+            as_set = found if self.config.delay is not None else replace(found, delay=self.structure.delay)
+            if as_set not in known:
                 raise ValueError(f"the state must be of {self.structure}, got {predictor.structure}")
         self.predictors[:] = map(copy_of, predictors)
         self.judge_by(ArxMemory())
@@ -364,7 +367,7 @@ class ArxReference(Reference):
         Raises:
             ValueError: the memory is of other settings.
         """
-        shape = self.structure.history, len(self.config.signals)
+        shape = self.history, len(self.config.signals)
         if memory.past is not None and memory.past.shape != shape:
             raise ValueError(f"rows before must have shape {shape}, got {memory.past.shape}")
         self._memory, self.obstacles = memory, {}
@@ -372,6 +375,11 @@ class ArxReference(Reference):
         self._ranges = list(enumerate(zip(memory.low, memory.high, strict=True))) if self._uses_inputs.any() else []
         if memory.past is not None:
             self._set_matrices(*shape)
+
+    @property
+    def history(self) -> int:
+        """Number of rows before a row that the models need."""
+        return max(predictor.structure.history for predictor in self.predictors)
 
     def copy(self) -> "ArxReference":
         """Models that stand where these do, and judge nothing."""

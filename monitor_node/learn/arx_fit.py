@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from math import nan
 
 import numpy as np
+from msgspec.structs import replace
 
 from monitor_node.ingest.alignment import regular_intervals
 from monitor_node.learn.arx import ArxMemory, ArxPredictor, ArxReference, judging_structures, simpler_structures
@@ -16,8 +17,10 @@ from reactorwatch.arrays import Array
 from reactorwatch.contract.messages_pb2 import Check, ModelSnapshot, Parameter
 from reactorwatch.errors import InputError
 from reactorwatch.identification.checks import ResidualTest, check_record, independence, whiteness
-from reactorwatch.identification.data import Rows, rows_of
+from reactorwatch.identification.data import Dataset, Rows, rows_of
+from reactorwatch.identification.dead_time import better_structure
 from reactorwatch.identification.identify import WORST_MINUS_LOG10_P
+from reactorwatch.identification.linear import fit_linear
 from reactorwatch.identification.linear_model import standard_deviations
 from reactorwatch.identification.structure import Structure
 from reactorwatch.spc.charts.parameters import learn
@@ -65,8 +68,13 @@ def fit_models(models: ArxReference, rows: RowArrays, *, to_judge: bool = False)
 def _fit_model(models: ArxReference, index: int, rows: RowArrays, to_judge: bool) -> Array:
     """Fit the model of an output; returns its residuals, shape (n,)."""
     model, outputs, residual = models.predictors[index], rows.outputs[:, index], np.full(rows.time_min.size, nan)
-    structure = _best_structure(judging_structures(models.config), rows, outputs) if to_judge else None
-    structure = structure or _fitting_structure(models.structure, rows, outputs)
+    if to_judge:  # the dead times were found before
+        delay = model.structure.delay if model.structure.inputs else models.structure.delay
+        structures = [replace(item, delay=delay) for item in judging_structures(models.config)]
+        structure = _best_structure(structures, rows, outputs)
+        structure = structure or _fitting_structure(replace(models.structure, delay=delay), rows, outputs)
+    else:
+        structure = _fitting_structure(_with_dead_times(models, model.structure, rows, outputs), rows, outputs)
     if structure is not None and structure != model.structure:
         model = _learn_again(models, index, structure, rows)
     scaling = model.scaling
@@ -94,6 +102,19 @@ def _fit_model(models: ArxReference, index: int, rows: RowArrays, to_judge: bool
         snapshot.checks.extend(_check_fit(structure, rows._replace(inputs=inputs, outputs=outputs), residual))
         model.reference_model = snapshot.SerializeToString()
     return residual
+
+
+def _with_dead_times(models: ArxReference, structure: Structure, rows: RowArrays, outputs: Array) -> Structure:
+    """A structure with the dead times that its residuals show, where the settings state none and residuals count."""
+    if models.config.delay is not None or models.config.has_values_only or not structure.inputs:
+        return structure
+    data = Dataset(rows.time_min, rows.inputs, outputs[:, None], models.config.inputs, "output")
+    try:
+        residuals = fit_linear("arx", structure, *data.arrays).residuals(*data.arrays)[:, 0]
+        shown = independence(residuals, data.inputs, structure.delay, time=data.time).minus_log10_p
+    except InputError:  # too few rows, or they do not determine the model
+        return structure
+    return (better_structure(structure, data) if shown >= WORST_MINUS_LOG10_P else None) or structure
 
 
 def _best_structure(structures: Sequence[Structure], rows: RowArrays, outputs: Array) -> Structure | None:
@@ -216,7 +237,7 @@ def start_judging(models: ArxReference, rows: RowArrays) -> None:
         margin = np.maximum(margin, reach - 0.5 * (high - low))
     memory = ArxMemory((low - margin).tolist(), (high + margin).tolist())
     if models.config.has_values_only:
-        history, late = models.structure.history, np.flatnonzero(~regular_intervals(time_min))
+        history, late = models.history, np.flatnonzero(~regular_intervals(time_min))
         newest = np.column_stack([inputs, outputs])[(late[-1] + 1 if late.size else 0) :][: -history - 1 : -1]
         memory.past = np.full((history, newest.shape[1]), nan)
         memory.past[: len(newest)] = newest

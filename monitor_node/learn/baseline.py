@@ -108,7 +108,7 @@ class TrainingResult(NamedTuple):
 def fewest_values(config: MonitorConfig, model: ProcessModel | None) -> int:
     """Least number of values of each output that a training needs."""
     structure = arx_structure(config)
-    of_one_input = replace(structure, inputs=min(structure.inputs, 1))
+    of_one_input = replace(structure, inputs=min(structure.inputs, 1), delay=max(structure.delays, default=1))
     return FEWEST_ROWS if model is not None else max(arx_fit.fewest_rows(of_one_input), FEWEST_ROWS)
 
 
@@ -243,8 +243,11 @@ class _Choice:
         is_driven = bool(self._config.inputs and self._has_all_inputs)  # without inputs there is nothing to simulate
         # after fewer, too many values of the inputs are unfamiliar to a black box, and it judges too few rows
         is_long = len(self.rows.time_min) >= 200
-        if wanted == "black-box" or (wanted == "auto" and is_driven and is_long):
-            black_box = self._fit_black_box()
+        fitted = [delay for predictor in models.predictors for delay in predictor.structure.delays]
+        delays = fitted or models.structure.delays or (1,)
+        has_one_delay = max(delays) - min(delays) <= 1  # to a row, as the search is; a black box has one for all inputs
+        if wanted == "black-box" or (wanted == "auto" and is_driven and is_long and has_one_delay):
+            black_box = self._fit_black_box(min(delays))
             if black_box is not None:
                 self.weakness = black_box.reference.weakness  # ARX models know no better how the plant follows
                 if wanted == "black-box" or (not self.weakness and _predicts_as_well(black_box, identified)):
@@ -269,11 +272,11 @@ class _Choice:
 
         return self._fit(fit, possible)
 
-    def _fit_black_box(self) -> _Candidate | None:
+    def _fit_black_box(self, delay: int) -> _Candidate | None:
         """Fit a black box; None if the rows do not allow it."""
 
         def fit(rows: RowArrays) -> tuple[Reference, Array]:
-            return BlackBoxReference.learn(rows, self.rows.outputs, self.smallest, self._config.delay)
+            return BlackBoxReference.learn(rows, self.rows.outputs, self.smallest, delay)
 
         try:
             return self._fit(fit, self.given)

@@ -12,11 +12,13 @@ from collections.abc import Sequence
 from typing import TypeAlias
 
 import numpy as np
+from msgspec.structs import replace
 from scipy.linalg import block_diag
 
 from reactorwatch.arrays import Array
 from reactorwatch.errors import InputError, UnfitRecordError
 from reactorwatch.identification.data import Dataset, rows_of
+from reactorwatch.identification.linear import fit_linear
 from reactorwatch.identification.structure import Delay, Structure
 
 LONGEST = 25  # rows; the studied dead times end at 20, with 5 to spare
@@ -53,6 +55,20 @@ def resolve_delay(delay: DelayChoice, data: Dataset) -> Delay:
 def name_delays(delay: Delay, inputs: Sequence[str]) -> int | dict[str, int]:
     """Delay of a structure in an answer: by the name of each input where they differ."""
     return delay if isinstance(delay, int) else dict(zip(inputs, delay, strict=True))
+
+
+def better_structure(structure: Structure, data: Dataset) -> Structure | None:
+    """A structure with the dead times that are found; None where an ARX model predicts no better with them.
+
+    Those that are a row off at most are kept, as the search is right to a row, and so are all where rows are too few.
+    """
+    try:
+        found = replace(structure, delay=find_dead_times(data))
+        here, there = (fit_linear("arx", item, *data.arrays).noise_sd for item in (structure, found))
+    except InputError:
+        return None
+    is_better = there < here and np.max(np.abs(np.subtract(found.delays, structure.delays))) > 1
+    return found if is_better else None
 
 
 def find_dead_times(data: Dataset) -> tuple[int, ...]:

@@ -12,7 +12,7 @@ from reactorwatch.arrays import Array
 from reactorwatch.errors import InputError, UnfitRecordError, describe_unknown
 from reactorwatch.identification.checks import DEFAULT_LAGS, check_record, independence, whiteness
 from reactorwatch.identification.data import Dataset, RunPlan, plan_run, rows_of
-from reactorwatch.identification.dead_time import DelayChoice, find_dead_times, name_delays, resolve_delay
+from reactorwatch.identification.dead_time import DelayChoice, better_structure, name_delays, resolve_delay
 from reactorwatch.identification.least_squares import SINGULAR_CONDITION, LeastSquares
 from reactorwatch.identification.linear import fit_linear, unscale
 from reactorwatch.identification.linear_model import Kind, LinearModel, fit_percent, free_run_percent, simulate
@@ -401,18 +401,13 @@ def _verdict(minus_log10_p: float, wrong: str, find_cause: Callable[[], str] = s
 
 
 def _other_dead_time(structure: Structure, data: Dataset) -> str:
-    """Dead times that an ARX model predicts better with than with those of a structure; empty if there are none."""
-    try:
-        found = Structure(structure.output_lags, structure.input_lags, find_dead_times(data), structure.inputs)
-        here, there = (fit_linear("arx", item, *data.arrays).noise_sd for item in (structure, found))
-    except InputError:  # too few rows to search
-        return ""
-    differences = np.abs(np.subtract(found.delays, structure.delays))
-    if there >= here or max(differences) <= 1:  # the search is right to a row
+    """Dead times that an ARX model predicts better with; empty if there are none."""
+    found = better_structure(structure, data)
+    if found is None:
         return ""
     if isinstance(found.delay, int):
         return f"dead time {found.delay} rows, where the model has {structure.delay} (--delay {found.delay})"
-    named = [f"{name}={rows}" for name, rows in zip(data.input_names, found.delays, strict=True)]
+    named = [f"{name}={rows}" for name, rows in zip(data.input_names, found.delay, strict=True)]
     return f"dead time {' '.join(named)} rows, where the model has others (--delay {','.join(named)})"
 
 

@@ -94,14 +94,20 @@ class Structure(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     def parameter_names(self) -> tuple[str, ...]:
         """Names of the parameters, in order; inputs are numbered only where there are several.
 
+        b1 is of the row that is the shortest delay back, for each input.
+
         >>> Structure.of_order(2).parameter_names()
         ('a1', 'a2', 'b1', 'b2', 'c')
         >>> Structure.of_order(1, inputs=2).parameter_names()
         ('a1', 'b1_1', 'b1_2', 'c')
+        >>> Structure.of_order(1, delay=(2, 5), inputs=2).parameter_names()
+        ('a1', 'b1_1', 'b4_2', 'c')
         """
         suffixes = [""] if self.inputs == 1 else [f"_{i + 1}" for i in range(self.inputs)]
         names = [f"a{lag}" for lag in range(1, self.output_lags + 1)]
-        names += [f"b{lag}{suffix}" for lag in range(1, self.input_lags + 1) for suffix in suffixes]
+        later = [delay - min(self.delays) for delay in self.delays]
+        pairs = list(zip(later, suffixes, strict=True))
+        names += [f"b{lag + rows}{suffix}" for lag in range(1, self.input_lags + 1) for rows, suffix in pairs]
         return tuple([*names, "c"] if self.offset else names)
 
 

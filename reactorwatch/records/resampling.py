@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from reactorwatch.arrays import Array
-from reactorwatch.errors import InputError, describe_unknown
+from reactorwatch.errors import InputError, UnfitRecordError, describe_unknown
 from reactorwatch.records.file_format import INTERPOLATED, LAST, MEAN, SECONDS, SPARSE, ResampleRule
 from reactorwatch.records.record import Record, join_runs
 
@@ -84,7 +84,8 @@ def resample(record: Record, rule: ResampleRule, roles: Mapping[str, str]) -> Re
         The record; `read_as` states period, methods and gaps. Rows in gaps, and those without any value, are left out.
 
     Raises:
-        InputError: the rule names a signal that is not there, no signal has two values, or the period is too short.
+        InputError: the rule names a signal that is not there, no signal has two values or no row one, or the period is
+            too short.
     """
     for name in rule.methods:
         if name not in record.columns:
@@ -116,8 +117,11 @@ def resample(record: Record, rule: ResampleRule, roles: Mapping[str, str]) -> Re
     for (run, own), times in zip(runs, stamps, strict=True):
         if times.size:
             rows, found = _find_rows(record.name, times, period_min, gap)
-            resampled.append(_resample_run(run, own, plans, float(times[0]), period_min, rows))
+            made = _resample_run(run, own, plans, float(times[0]), period_min, rows)
+            resampled += [made] if made.rows else []
             gaps += found
+    if not resampled:
+        raise UnfitRecordError(f"{record.name}: --resample: no row has a value; state another period")
     read_as = ", ".join(filter(None, [record.read_as, _state(period_min, reason, plans, gaps)]))
     return replace(join_runs(resampled), read_as=read_as)
 
@@ -165,7 +169,7 @@ def find_period_min(name: str, spacings: Mapping[str, Array], by_exception: set[
     """
     medians = {signal: float(np.median(values)) for signal, values in spacings.items() if values.size}
     if not medians:
-        raise InputError(f"{name}: --resample auto: expected a signal with two values, got none; state a period")
+        raise UnfitRecordError(f"{name}: --resample auto: expected a signal with two values, got none; state a period")
     sampled = {signal: value for signal, value in medians.items() if signal not in by_exception} or medians
     fastest = min(sampled, key=sampled.__getitem__)
     amount, unit = _in_unit(sampled[fastest])

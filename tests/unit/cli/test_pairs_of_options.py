@@ -114,7 +114,7 @@ IDENTIFY = {
     "files": ["csv", "gz", "parquet", "runs", "gaps"],
     "model": ["", *(f"--model {name}" for name in ("oe", "armax", "bj", "narx", "noe"))],
     "order": ["", "--order 1"],
-    "delay": ["", "--delay 4"],
+    "delay": ["", "--delay 4", "--delay auto"],
     "validate": ["", "--validate {plant}_later.csv"],
     "settle": ["", "--settle 10"],
     "recursive": [

@@ -88,6 +88,33 @@ def test_a_row_waits_no_longer_than_the_reordering() -> None:
     assert numbers(feed(aligner, [("qc", 5)])) == [2, 3, 4]
 
 
+@pytest.mark.parametrize(("awaits_all", "delay_rows"), [(False, 1), (True, 3)])
+def test_a_row_without_a_value_of_the_laboratory_waits_for_one_newer_row(*, awaits_all: bool, delay_rows: int) -> None:
+    """C has a value in every fifth row; what is learned of it is in the rows emitted last."""
+    aligner, delays = Aligner(SIGNALS, 3, awaits_all=awaits_all), []
+    for number in range(100):
+        for signal in ("qc", "C", "T") if number % 5 == 0 else ("qc", "T"):
+            rows = aligner.update(signal, number * PERIOD, number // 5 if signal == "C" else number, 1.0)
+            delays += [number - row.time_ns // PERIOD for row in rows]
+    assert max(delays[40:]) == delay_rows
+    assert aligner.memory.counts.late == aligner.memory.counts.lost == 0
+
+
+def test_a_signal_that_comes_late_after_a_pause_is_awaited_again() -> None:
+    """C pauses for 40 rows and then comes two rows late, within the reordering of three."""
+    aligner, rows = Aligner(SIGNALS, 3), []
+    for number in range(120):
+        samples = [("qc", number, number), ("T", number, number)]
+        if number < 40:
+            samples.append(("C", number, number))
+        elif number >= 82:
+            samples.append(("C", number - 2, number - 42))
+        for signal, at, sequence in samples:
+            rows += aligner.update(signal, at * PERIOD, sequence, 1.0)
+    values = {row.time_ns // PERIOD: row.values[SIGNALS.index("C")] for row in rows}
+    assert [number for number in range(100, 115) if math.isnan(values[number])] == []
+
+
 def test_a_row_that_is_lost_altogether_holds_the_others_up_no_longer() -> None:
     aligner = Aligner(SIGNALS, 3)
     rows = feed(aligner, [item for item in in_order(5) if item[1] != 2])
