@@ -9,7 +9,7 @@ import msgspec
 
 from reactorwatch.contract.keys import DEFAULT_PLANT, check_plant
 from reactorwatch.description.read import find_process
-from reactorwatch.records.file_format import INTERPOLATED, ResampleRule, parse_resampling
+from reactorwatch.records.file_format import ResampleRule, parse_resampling
 from reactorwatch.runtime.config import check_bounds
 from reactorwatch.spc.charts.base import Setting, SignalSetting
 from reactorwatch.spc.charts.catalogue import CHARTS, chart
@@ -57,13 +57,13 @@ class DefaultCharts(tuple[str, ...]):
     __slots__ = ()
 
 
-USUAL_CHARTS = DefaultCharts(("shewhart", "ewma", "mewma"))
+USUAL_CHARTS = DefaultCharts(("shewhart", "ewma", "mewma", "level"))
 """Charts where the settings name none."""
 
-CHARTS_OF_MANY = DefaultCharts(("residual_space",))
+CHARTS_OF_MANY = DefaultCharts(("residual_space", "level"))
 """Charts where the settings name none, of many outputs that no equations judge."""
 
-CHARTS_OF_DOZENS = DefaultCharts(("residual_space", "cva_residual"))
+CHARTS_OF_DOZENS = DefaultCharts(("residual_space", "cva_residual", "level"))
 """Charts where the settings name none, of `DOZENS` outputs or more that no equations judge."""
 
 DOZENS = 20
@@ -136,7 +136,8 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
         process: process of the plant: a name in the catalogue, or a .toml, .py or extended.json file; None: the
             nominal reactor where its signals are watched; empty: no equations judge.
         charts: charts of the residuals and of the values; where none are named, `residual_space` for 8 outputs or more
-            that no equations judge, with `cva_residual` from 20 on, else `shewhart`, `ewma` and `mewma`.
+            that no equations judge, with `cva_residual` from 20 on, else `shewhart`, `ewma` and `mewma`; beside them
+            `level`.
         false_alarms_per_30_days: number of false alarms in 30 days of the plant, over all alarms; None: 1, or 1
             in 8,640 rows if rows are slower than 5 min; the fewest that the charts can keep if that is more.
         smallest_sd: least standard deviation of the residual by output, in its unit; smaller deviations do not matter.
@@ -286,10 +287,6 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
         rule = parse_resampling(self.resample, "resample")
         if rule.period_s is None:
             raise ValueError(f"resample must state a period, such as 10 s, got {self.resample!r}")
-        if INTERPOLATED in (rule.method, *rule.methods.values()):
-            raise ValueError(
-                f"resample cannot interpolate to a value that has not come, got {self.resample!r}; use last"
-            )
         return rule
 
     @property

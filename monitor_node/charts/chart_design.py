@@ -12,6 +12,7 @@ from reactorwatch.contract import keys
 from reactorwatch.spc import false_alarm_budget
 from reactorwatch.spc.charts.base import Baseline, Chart, JointChart, SignalChart, complete_rows
 from reactorwatch.spc.charts.catalogue import chart
+from reactorwatch.spc.charts.level import Level
 from reactorwatch.spc.charts.value_chart import ValueBaseline, ValueChart
 from reactorwatch.spc.detection import Detector
 from reactorwatch.spc.false_alarm_budget import TrainingErrors
@@ -95,7 +96,9 @@ class ChartDesign:
             if issubclass(kind := chart(name), ValueChart) and (why := kind.obstacle(baseline))
         }
         charts = [name for name in dict.fromkeys(self._config.charts) if name in self.names and name not in obstacles]
-        self.evaluated, self.chosen = evaluated, charts or [name for name in self.names if name not in obstacles]
+        if not set(charts) - {Level.name} and len(charts) < len(self._config.charts):  # it sees slow changes only
+            charts = [name for name in self.names if name not in obstacles]
+        self.evaluated, self.chosen = evaluated, charts
         return {keys.chart_name(name, ALL): why for name, why in obstacles.items()}
 
     @property

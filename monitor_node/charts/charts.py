@@ -25,6 +25,7 @@ from reactorwatch.contract.codec import Publication
 from reactorwatch.contract.messages_pb2 import ChartPoint
 from reactorwatch.spc.charts.base import Chart, JointChart, Judgement, Shown, SignalChart
 from reactorwatch.spc.charts.catalogue import chart
+from reactorwatch.spc.charts.level import Level
 from reactorwatch.spc.charts.shewhart import designed_width
 from reactorwatch.spc.charts.value_chart import ValueChart
 from reactorwatch.spc.compiled_chart import Bank, CompiledChart, SignalMemory
@@ -230,8 +231,9 @@ class ChartWatch:
 
     @property
     def is_ordinary(self) -> bool:
-        """True if all charts are made, and at most their alarms remember points."""
-        return list(self._watched) == self.design.names and self._board.is_at_rest(self._alarms.values())
+        """True if all charts are made, perhaps but the last, of levels, and at most their alarms remember points."""
+        made, names = list(self._watched), self.design.names
+        return names in (made, [*made, Level.name]) and self._board.is_at_rest(self._alarms.values())
 
     @property
     def reads_values(self) -> bool:
@@ -241,7 +243,10 @@ class ChartWatch:
     def load(self, p: np.void) -> None:
         """Fill the numbers of a plant, see `row_frame.FrameTypes`, from the charts and their alarms."""
         for name, memory in self.memory.charts.items():
-            p[name] = memory.numbers
+            p[name][: len(memory.numbers)] = memory.numbers
+        levels = self.memory.charts.get(Level.name)
+        indices = [] if levels is None else [self._config.signals.index(name) for name in levels.names]
+        p["level_signals"][: 1 + len(indices)] = [len(indices), *indices]
         for delay, alarm in zip(p["delays"], self._alarms.values(), strict=False):
             memory = alarm.memory
             delay["recent"], delay["in_a_row"], delay["above"] = memory.recent, memory.in_a_row, memory.above
@@ -249,7 +254,7 @@ class ChartWatch:
     def store(self, p: np.void) -> None:
         """Take over into the charts what compiled steps have written into the numbers of a plant."""
         for name, memory in self.memory.charts.items():
-            memory.numbers[:] = p[name]
+            memory.numbers[:] = p[name][: len(memory.numbers)]
 
     def store_delays(self, p: np.void) -> None:
         """Take over into the alarms what compiled steps have written into the numbers of a plant."""

@@ -4,8 +4,8 @@ Rows are at whole periods since 1970-01-01 UTC. They are made of sample times al
 as soon as a sample a period later has come: only then is the input known that acts until the next row. Methods are
 those of records (`reactorwatch.records.resampling`): an input is the mean over the period that begins at its row, held
 until it is sent again, an output the mean around its row; one with fewer values than rows has them in its own rows
-only, unless a method is stated; if that is `mean`, its last value is held. Rows without any value, as in a gap, are
-left out.
+only, unless a method is stated; if that needs the next value (`mean`, `interpolated`), its last one is held. Rows
+without any value, as in a gap, are left out.
 """
 
 from math import isnan
@@ -14,7 +14,7 @@ import numpy as np
 from msgspec import field
 
 from monitor_node.ingest.alignment import Row
-from reactorwatch.records.file_format import LAST, MEAN, SPARSE, ResampleRule
+from reactorwatch.records.file_format import INTERPOLATED, LAST, MEAN, SPARSE, ResampleRule
 from reactorwatch.records.resampling import DIGITS, LONGEST_HOLD, SLOW, SignalPlan, values_in_rows
 from reactorwatch.stored_state import Memory
 
@@ -108,7 +108,7 @@ class Resampler:
         spacing = float(np.median(np.diff(periods))) if len(times) > 1 else 1.0
         is_slow = len(times) < 2 or spacing > SLOW
         method = self._stated[index] or (SPARSE if is_slow and not is_input else MEAN)
-        if method == MEAN and is_slow and not is_input:
+        if is_slow and (method == INTERPOLATED or (method == MEAN and not is_input)):
             method = LAST  # the next value has not come, and is not known to come
         longest = np.inf if is_input or method == LAST else LONGEST_HOLD * max(1.0, spacing)
         plan = SignalPlan(method, is_input, is_slow, spacing, longest)

@@ -25,6 +25,9 @@ from reactorwatch.process.model import MODEL_CACHE_SIZE, ProcessModel
 from reactorwatch.records.record import MINUTE_NS
 from reactorwatch.stored_state import Memory, copy_of
 
+WANDER_ROWS = 10.0
+"""Time constant of a wandering input, in rows, at which its search starts."""
+
 
 class ProcessMemory(Memory, tag="process"):
     """Memory of a `ProcessReference`.
@@ -108,7 +111,7 @@ class ProcessReference(FilterReference):
     ) -> "ProcessReference":
         """Make a reference with the noise that is fitted to a training, see `fit_training_noise`."""
         found = fit_training_noise(model, outputs, rows, smallest_sd, model.uncertain)
-        learned = tuple(found.parameters[name] for name in learned_parameters(model.uncertain))
+        learned = tuple(found.parameters[name] for name in learned_parameters(model, model.uncertain))
         if not any(map(is_disturbance, model.uncertain)):
             return cls(model, outputs, ProcessMemory(found.levels, learned))
         alone = fit_training_noise(model, outputs, rows, smallest_sd, ())
@@ -346,10 +349,17 @@ def fit_training_noise(
     columns, smallest = model_outputs(model, outputs, rows.outputs), [1e-6] * len(model.outputs)
     for i, sd in zip(output_indices(model, outputs), smallest_sd, strict=True):
         smallest[i] = sd
+    wide, starts = widen_model(model, uncertain), first_times(model, uncertain, rows)
     return fit_noise(
-        widen_model(model, uncertain),
+        wide.with_values(starts) if starts else wide,
         FilterRecord(rows.time_min, _mask_before_missing(rows.time_min, rows.inputs), columns),
         smallest,
-        learned_parameters(uncertain),
+        learned_parameters(model, uncertain),
         nearby=noise_starts(model, uncertain, columns, smallest),
     )
+
+
+def first_times(model: ProcessModel, uncertain: tuple[str, ...], rows: RowArrays) -> dict[str, float]:
+    """Time constants in minutes of inputs that wander at which their search starts, by name of the parameter."""
+    first_min = WANDER_ROWS * float(np.median(np.diff(rows.time_min)))
+    return {name: first_min for name in learned_parameters(model, uncertain) if name.endswith(".wander_min")}

@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 import msgspec
 import numpy as np
 
-from monitor_node.learn.process_reference import fit_training_noise, model_outputs, output_indices
+from monitor_node.learn.process_reference import first_times, fit_training_noise, model_outputs, output_indices
 from monitor_node.learn.training_rows import RowArrays, TrainingRows, screen_baseline
 from reactorwatch.arrays import Array
 from reactorwatch.contract.messages_pb2 import Baseline
@@ -33,6 +33,7 @@ from reactorwatch.diagnosis.whiteness import minus_log10_p
 from reactorwatch.errors import InputError
 from reactorwatch.kalman.batch import GATE, LONGEST_GAP_MIN, FilterRecord, FilterResult
 from reactorwatch.kalman.ekf import Filter, FilterState
+from reactorwatch.kalman.ekf_step import NoiseLevels
 from reactorwatch.kalman.filter_states import (
     CONSTANT,
     NOISE,
@@ -42,7 +43,7 @@ from reactorwatch.kalman.filter_states import (
     select_effects,
     widen_model,
 )
-from reactorwatch.kalman.noise_estimation import NoiseFit
+from reactorwatch.kalman.noise_estimation import NoiseFit, losses_nearby, resolution_sd
 from reactorwatch.process import DEFAULT_PROCESS, effects_of, own_effects
 from reactorwatch.process.effect import Effect
 from reactorwatch.process.extended_model import parse_extended_model, stored_model
@@ -163,7 +164,7 @@ def diagnose_training(job: DiagnosisJob) -> Finding:
     if extended is not None:
         uncertain = find_uncertain(parse_extended_model(_json(extended)).build(), outputs, rows)
     if uncertain.names:
-        why = f"{why}; {describe_uncertain(uncertain.names)}"
+        why = f"{why}; {describe_uncertain(uncertain.names, model.input_names)}"
     if extended is None and not uncertain.names:
         return Finding(job.first_ns, verdict, why)
     found = parse_extended_model(job.equations).to_object() if extended is None else extended
@@ -246,6 +247,12 @@ LEAST_ROWS = 100
 LEAST_GAIN = 8.0
 """Gain of log likelihood beyond which something is taken for a part of the plant."""
 
+MOST_DISTURBANCES = 4
+"""Number of disturbances from which on no further one is sought: a filter of so many more states would be slow."""
+
+MOST_FITTED = 2
+"""Number of single disturbances that are fitted to find the next: the likeliest with the other noise as it is."""
+
 MOVE_ROWS = 60
 """Number of rows after a move of an input that are predicted."""
 
@@ -260,32 +267,44 @@ def find_uncertain(model: ProcessModel, outputs: tuple[str, ...], rows: RowArray
         plain = fitter.fit(())
     x = np.nanmedian(fitter.filter(plain).x, axis=0)
     constants = tuple(f"{CONSTANT} {name}" for name in select_effects(model, x, np.nanmedian(rows.inputs, axis=0)))
-    best = fitter.fit(constants)
-    candidates = [f"{WANDER} {item.name}" for item in model.states if item.name not in model.at_rest]
-    candidates += [f"{NOISE} {name}" for name in outputs]
-    while len(best.uncertain) < len(constants) + 2 and fitter.are_coloured(best):
-        fits = (fitter.fit((*best.uncertain, item)) for item in candidates if item not in best.uncertain)
-        found = min(fits, key=lambda item: item.noise.loss)
-        if found.noise.loss > best.noise.loss - LEAST_GAIN:
+    wide = fitter.fit(constants)
+    best = wide if wide.noise.loss < plain.noise.loss - LEAST_GAIN else plain
+    most = len(best.uncertain) + MOST_DISTURBANCES
+    inputs = tuple(f"{WANDER} {name}" for name in model.input_names)
+    balances = [item.name for item in model.states if item.name not in model.at_rest]
+    singles = [*(f"{WANDER} {name}" for name in balances), *inputs, *(f"{NOISE} {name}" for name in outputs)]
+    while len(best.uncertain) < most and fitter.are_coloured(best):
+        further: list[tuple[str, ...]] = [(item,) for item in singles if item not in best.uncertain]
+        further = sorted(further, key=lambda item: fitter.loss_with(best, item))[:MOST_FITTED]
+        if not {*inputs} & {*best.uncertain} and len(inputs) > 1:
+            further.append(inputs)  # one alone explains little of what several do
+        fits = [fitter.fit((*best.uncertain, *item)) for item in further]
+        found = min(fits, key=lambda item: item.noise.loss + LEAST_GAIN * len(item.uncertain))
+        if found.noise.loss > best.noise.loss - LEAST_GAIN * (len(found.uncertain) - len(best.uncertain)):
             break
         best = found
-    if best.uncertain != constants or plain.noise.loss - best.noise.loss > LEAST_GAIN:
-        learned = (best.noise.parameters[name] for name in learned_parameters(best.uncertain))
-        return Uncertain(best.uncertain, tuple(learned))
-    certain, uncertain = fitter.sds_after_moves(plain), fitter.sds_after_moves(best)
-    # the training leaves open how the plant follows
-    return Uncertain(constants) if np.any(uncertain > 1.25 * certain) else Uncertain()
+    if not {*constants} <= {*best.uncertain}:
+        wide = fitter.fit((*constants, *best.uncertain)) if best.uncertain else wide
+        certain, uncertain = fitter.sds_after_moves(best), fitter.sds_after_moves(wide)
+        if np.any(uncertain > 1.25 * certain):  # the training leaves open how the plant follows
+            best = wide
+    learned = (best.noise.parameters[name] for name in learned_parameters(model, best.uncertain))
+    return Uncertain(best.uncertain, tuple(learned))
 
 
-def describe_uncertain(uncertain: Sequence[str]) -> str:
+def describe_uncertain(uncertain: Sequence[str], inputs: Sequence[str]) -> str:
     """Describe the additional states of a filter in words."""
-    parts = {
-        WANDER: [item.split(" ", 1)[1] for item in uncertain if item.startswith(f"{WANDER} ")],
-        NOISE: [item.split(" ", 1)[1] for item in uncertain if item.startswith(f"{NOISE} ")],
-    }
-    words = [f"a disturbance of the balance of {name} wanders" for name in parts[WANDER]]
+    parts: dict[str, list[str]] = {CONSTANT: [], WANDER: [], NOISE: []}
+    for kind, name in (item.split(" ", 1) for item in uncertain):
+        parts[kind].append(name)
+    words = [
+        f"{name} wanders about its recorded value"
+        if name in inputs
+        else f"a disturbance of the balance of {name} wanders"
+        for name in parts[WANDER]
+    ]
     words += [f"the noise of {name} has memory" for name in parts[NOISE]]
-    if any(not is_disturbance(item) for item in uncertain):
+    if parts[CONSTANT]:
         words.append("limits allow for what the training leaves open of the constants")
     return ", ".join(words)
 
@@ -306,9 +325,26 @@ class _NoiseFitter:
 
     def fit(self, uncertain: tuple[str, ...]) -> _Fit:
         """Fit the noise of the model with uncertain parts."""
-        model, smallest = self._model, [1e-6] * len(self._outputs)
+        model, smallest = self._model, [max(resolution_sd(column), 1e-6) for column in self._rows.outputs.T]
         found = fit_training_noise(model, self._outputs, self._rows, smallest, uncertain)
         return _Fit(uncertain, found, Filter(widen_model(model, uncertain), found.levels, found.parameters))
+
+    def loss_with(self, item: _Fit, added: tuple[str, ...]) -> float:
+        """Smallest loss with disturbances of several sizes added to a fit, its noise levels as they are."""
+        model, levels = widen_model(self._model, (*item.uncertain, *added)), item.noise.levels
+        known = dict(zip(item.filter.model.state_names, levels.process_sd, strict=True))
+        new = np.array([name not in known for name in model.state_names])
+        scales = np.array([state.scale for state in model.states])
+        before = np.array([known.get(name, 0.0) for name in model.state_names])
+        columns = model_outputs(self._model, self._outputs, self._rows.outputs)
+        tried = [
+            NoiseLevels(levels.measurement_sd, tuple(np.where(new, share * scales, before).tolist()))
+            for share in (3.0, 1.0, 0.3, 0.1, 0.03, 0.01)
+        ]
+        record = FilterRecord(self._rows.time_min, self._rows.inputs, columns)
+        smallest = [1e-9] * len(model.outputs)  # levels that were fitted keep the true bounds
+        times = first_times(self._model, (*item.uncertain, *added), self._rows) | dict(item.noise.parameters)
+        return min(losses_nearby(model.with_values(times) if times else model, record, smallest, tried))
 
     def drop_disturbances(self, item: _Fit) -> bool:
         """Leave out disturbed intervals and outliers, as a training does; returns true if there are any."""

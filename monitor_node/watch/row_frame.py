@@ -16,6 +16,8 @@ from reactorwatch.arrays import Array
 from reactorwatch.codegen.numba_kernel import carray, jit, pointer_at
 from reactorwatch.spc.charts.cusum import Cusum
 from reactorwatch.spc.charts.ewma import Ewma
+from reactorwatch.spc.charts.level import Level
+from reactorwatch.spc.charts.level import count_numbers as count_level_numbers
 from reactorwatch.spc.charts.mewma import Mewma, count_numbers
 from reactorwatch.spc.charts.shewhart import Shewhart
 from reactorwatch.spc.compiled_chart import SETTINGS
@@ -23,7 +25,7 @@ from reactorwatch.spc.prewhitening import WHITENER
 from reactorwatch.spc.silence import TIMEOUT
 from reactorwatch.spc.stuck import STUCK
 
-CHARTS = (Shewhart.name, Ewma.name, Cusum.name, Mewma.name)
+CHARTS = (Shewhart.name, Ewma.name, Cusum.name, Mewma.name, Level.name)
 """Charts that the step has, in its order."""
 
 POINT = 5
@@ -80,12 +82,15 @@ def frame_types(inputs: int, outputs: int, alarms: int) -> FrameTypes:
         ("ewma", "f8", (Ewma.numbers, outputs)),
         ("cusum", "f8", (Cusum.numbers, outputs)),
         ("mewma", "f8", (count_numbers(outputs),)),
+        ("level", "f8", (count_level_numbers(inputs, outputs),)),  # fewer where a signal does not vary
+        ("level_signals", "i8", (1 + inputs + outputs,)),  # number of its signals, and the index of each
         ("delays", DELAY, (max(alarms, 1),)),
     ]
     work = [
         ("new", "f8", (3 + 2 * inputs + 2 * outputs,)),  # new values of the filter, see `ekf_step.row_function`
         ("outputs", "f8", (5 * outputs + 1,)),  # its results
         ("e", "f8", (outputs,)),  # prewhitened residuals
+        ("values", "f8", (inputs + outputs,)),  # values of the signals of the chart of levels
         ("columns", "f8", (_COLUMNS, outputs)),  # columns of a bank of charts, see `compiled_chart`
         ("points", "f8", (max(alarms, 1), POINT)),  # points of the charts, one row an alarm
     ]
@@ -111,6 +116,8 @@ class Plant(NamedTuple):
     ewma: Array
     cusum: Array
     mewma: Array
+    level: Array
+    level_signals: Words
     delays: Any
 
 
@@ -120,6 +127,7 @@ class Work(NamedTuple):
     new: Array
     outputs: Array
     e: Array
+    values: Array
     columns: Array
     points: Array
 
@@ -179,7 +187,9 @@ def plant_at(frame: Words) -> Plant:
         carray(pointer_at(frame[_P + 7]), (_EWMA, outputs), np.float64),
         carray(pointer_at(frame[_P + 8]), (_CUSUM, outputs), np.float64),
         carray(pointer_at(frame[_P + 9]), (1 + 2 * outputs + 2 * outputs * outputs,), np.float64),
-        carray(pointer_at(frame[_P + 10]), (alarms,), DELAY),
+        carray(pointer_at(frame[_P + 10]), (count_level_numbers(inputs, outputs),), np.float64),
+        carray(pointer_at(frame[_P + 11]), (1 + inputs + outputs,), np.int64),
+        carray(pointer_at(frame[_P + 12]), (alarms,), DELAY),
     )
 
 
@@ -191,8 +201,9 @@ def work_at(frame: Words) -> Work:
         carray(pointer_at(frame[_WORK]), (3 + 2 * inputs + 2 * outputs,), np.float64),
         carray(pointer_at(frame[_WORK + 1]), (5 * outputs + 1,), np.float64),
         carray(pointer_at(frame[_WORK + 2]), (outputs,), np.float64),
-        carray(pointer_at(frame[_WORK + 3]), (_COLUMNS, outputs), np.float64),
-        carray(pointer_at(frame[_WORK + 4]), (alarms, POINT), np.float64),
+        carray(pointer_at(frame[_WORK + 3]), (inputs + outputs,), np.float64),
+        carray(pointer_at(frame[_WORK + 4]), (_COLUMNS, outputs), np.float64),
+        carray(pointer_at(frame[_WORK + 5]), (alarms, POINT), np.float64),
     )
 
 

@@ -46,6 +46,8 @@ from reactorwatch.records.record import MINUTE_NS
 from reactorwatch.spc.charts.base import LARGEST_VALUE
 from reactorwatch.spc.charts.cusum import _judge as judge_cusum
 from reactorwatch.spc.charts.ewma import _judge as judge_ewma
+from reactorwatch.spc.charts.level import LIMIT
+from reactorwatch.spc.charts.level import move as move_levels
 from reactorwatch.spc.charts.mewma import Mewma
 from reactorwatch.spc.charts.mewma import move as move_mewma
 from reactorwatch.spc.charts.shewhart import Shewhart
@@ -128,8 +130,8 @@ def _take_points(p: Any, work: Any, numbers: Array, settings: Any, first: int) -
 
 
 @inline
-def _update_charts(p: Any, work: Any, settings: Any) -> int:
-    """Update the charts with the prewhitened residuals; returns the verdict."""
+def _update_charts(p: Any, work: Any, settings: Any, values: Array) -> int:
+    """Update the charts with the prewhitened residuals and the values of the signals; returns the verdict."""
     constants, columns, e, verdict = settings.constants[0], work.columns, work.e, ORDINARY
     charts = constants.charts
     if charts[0] >= 0:
@@ -151,6 +153,17 @@ def _update_charts(p: Any, work: Any, settings: Any) -> int:
         point[0], point[1], point[2], point[3] = statistic, float(e.size), 0.0, limit
         point[4] = 1.0 if statistic > limit else 0.0
         verdict = max(verdict, _add_point(p.delays[charts[3]], point, settings, charts[3]))
+    count = p.level_signals[0]
+    if charts[4] >= 0 and count > 0:
+        point = work.points[charts[4]]
+        for i in range(count):
+            work.values[i] = values[p.level_signals[1 + i]]
+        statistic, limit = move_levels(p.level, work.values[:count]), p.level[LIMIT]
+        if statistic < 0.0:
+            return EVENT
+        point[0], point[1], point[2], point[3] = statistic, 0.0, 0.0, limit
+        point[4] = 1.0 if statistic > limit else 0.0
+        verdict = max(verdict, _add_point(p.delays[charts[4]], point, settings, charts[4]))
     return verdict
 
 
@@ -209,7 +222,7 @@ def step(
         work.e[i] = innovation(whitener, (value - work.outputs[i]) / work.outputs[2 * outputs + i])
         if not (abs(work.e[i]) <= p.spike_limits[i] and abs(work.e[i]) < LARGEST_VALUE):
             return EVENT
-    verdict = _update_charts(p, work, settings)
+    verdict = _update_charts(p, work, settings, values)
     if verdict == EVENT:
         return EVENT
     head.last_ns, head.time_min = time_ns, time_min

@@ -16,6 +16,9 @@ variance of every prediction, and every row narrows it (`widen_model`):
   navigation problems, Advances in Control Systems 3; Friedland 1969, Treatment of bias in recursive filtering, IEEE
   Trans. Automatic Control 14).
 - A disturbance of a balance that wanders: a first-order Gauss-Markov process, nearly a random walk.
+- An input that wanders about its recorded value: a first-order Gauss-Markov process whose time constant is learned. A
+  pump that does so moves several balances, at once or through each other: the innovations are white together, and not
+  only one by one.
 - Coloured noise of a sensor: a first-order Gauss-Markov process that is added to its reading.
 
 The effects of a catalogue are many, and most act nearly alike. `select_effects` takes the few whose combinations
@@ -178,22 +181,28 @@ def widen_model(model: ProcessModel, added: tuple[str, ...], values: tuple[float
     if not added:
         return model
     if values:
-        return widen_model(model, added).with_values(dict(zip(learned_parameters(added), values, strict=True)))
+        return widen_model(model, added).with_values(dict(zip(learned_parameters(model, added), values, strict=True)))
     effects = {item.name: item for item in named_effects(model)}
     for text in added:
         kind, name = text.split(" ", 1)
         if kind == CONSTANT:
             model = _add_constant(model, effects[name])
         elif kind == WANDER:
-            model = _add_wander(model, name)
+            model = _add_input_wander(model, name) if name in model.input_names else _add_wander(model, name)
         else:
             model = _add_noise(model, name)
     return model
 
 
-def learned_parameters(added: Sequence[str]) -> tuple[str, ...]:
-    """Names of the parameters of the added states that are learned with the noise levels."""
-    return tuple(f"{name}.memory_min" for kind, name in (item.split(" ", 1) for item in added) if kind == NOISE)
+def learned_parameters(model: ProcessModel, added: Sequence[str]) -> tuple[str, ...]:
+    """Names of the parameters of the states added to a model that are learned with the noise levels."""
+    names = []
+    for kind, name in (item.split(" ", 1) for item in added):
+        if kind == NOISE:
+            names.append(f"{name}.memory_min")
+        elif kind == WANDER and name in model.input_names:
+            names.append(f"{name}.wander_min")
+    return tuple(names)
 
 
 def is_disturbance(text: str) -> bool:
@@ -232,6 +241,17 @@ def _add_wander(model: ProcessModel, name: str) -> ProcessModel:
     state = variable(f"{name}.wander", f"{balance.unit}/min", (-reach, reach), 0.1 * balance.scale, "disturbance")
     # With a time constant of 200 min its variance stays finite where nothing is measured.
     return model.add_rate(name, state.symbol).with_state(state, -state.symbol / 200.0, ca.SX(0.0))
+
+
+def _add_input_wander(model: ProcessModel, name: str) -> ProcessModel:
+    """Add a deviation of an input from its recorded value."""
+    given = model.inputs[model.input_names.index(name)]
+    reach = given.upper - given.lower
+    state = variable(f"{name}.wander", given.unit, (-reach, reach), 0.1 * given.scale, "deviation from its record")
+    time = parameter(f"{name}.wander_min", 1.0, "min", (1e-3, 1e5), "time constant of the deviation")
+    model = model.substitute(given.symbol, given.symbol + state.symbol)
+    model = model.with_state(state, -state.symbol / time.symbol, ca.SX(0.0))
+    return replace(model, parameters=(*model.parameters, time))
 
 
 def _add_noise(model: ProcessModel, name: str) -> ProcessModel:

@@ -96,6 +96,15 @@ def fit_noise(
     return _NoiseSearch(model, record, smallest, learned, first_sd or {}).run(nearby, lacking)
 
 
+def losses_nearby(
+    model: ProcessModel, record: FilterRecord, smallest_sd: Sequence[float], levels: Sequence[NoiseLevels]
+) -> list[float]:
+    """Losses of `fit_noise` at some noise levels; arguments as there."""
+    search = _NoiseSearch(model, record, np.asarray(smallest_sd, dtype=float), (), {})
+    search.use_rows(record.time_min.size)
+    return [trial.loss for trial in search.evaluate([search.with_noise(item) for item in levels])]
+
+
 def noise_starts(
     model: ProcessModel, added: tuple[str, ...], measured: Array, smallest_sd: Sequence[float]
 ) -> list[NoiseLevels]:
@@ -131,7 +140,7 @@ class _NoiseSearch:
         first_sd: Mapping[str, float],
     ) -> None:
         self._full, measured = record, record.measured
-        self._use_rows(FIRST_ROWS)
+        self.use_rows(FIRST_ROWS)
         self._n_y = len(model.outputs)
         self._states = [i for i in range(len(model.states)) if i not in model.constant_states]
         self._of_states = range(self._n_y, self._n_y + len(self._states))
@@ -155,23 +164,23 @@ class _NoiseSearch:
         best = self._climb(self._drop_outliers(self._start()))
         rows = self._full.time_min.size
         if rows > FIRST_ROWS:
-            self._use_rows(rows)
-            starts = [best.theta, *(self._with_noise(levels) for levels in nearby)]
+            self.use_rows(rows)
+            starts = [best.theta, *(self.with_noise(levels) for levels in nearby)]
             starts += self._noisier_starts(best.theta) if lacking else []
-            best = min(self._evaluate(starts[:LANES]), key=lambda trial: trial.loss)
+            best = min(self.evaluate(starts[:LANES]), key=lambda trial: trial.loss)
             best = self._climb(self._drop_outliers(best))
         climbed = best
         for index in self._of_states:
             theta = best.theta.copy()
             theta[index] = self._lowest[index]
-            (without,) = self._evaluate([theta])
+            (without,) = self.evaluate([theta])
             if without.loss < best.loss + 2.0:  # as by Akaike's criterion
                 best = without
         if best is not climbed:  # the sensors' noise now has to account for more
             best, _ = self._step(best, range(self._n_y))
         return NoiseFit(self._levels(best.theta), self._changes(best.theta), best.loss, best.w)
 
-    def _with_noise(self, levels: NoiseLevels) -> Array:
+    def with_noise(self, levels: NoiseLevels) -> Array:
         """Theta of these levels, with noise in every state: no step leads out of none."""
         sensors = np.maximum(np.log(levels.measurement_sd), self._lowest[: self._n_y])
         # 3e-4 scales of noise are negligible, but steps can start from them.
@@ -185,7 +194,7 @@ class _NoiseSearch:
             item[self._of_states] = np.where(self._first_sd > 0.0, item[self._of_states], np.log(share * self._scales))
         return starts
 
-    def _use_rows(self, rows: int) -> None:
+    def use_rows(self, rows: int) -> None:
         """Use the first rows of the record from here on."""
         full, first = self._full, slice(rows)
         uncertainty = None if full.uncertainty is None else full.uncertainty.select(first)
@@ -200,7 +209,7 @@ class _NoiseSearch:
         with np.errstate(invalid="ignore"):
             measured = np.where(np.abs(run.residual) > GATE * run.sd, np.nan, record.measured)
         self._record = FilterRecord(record.time_min, record.inputs, measured, GATE, uncertainty=record.uncertainty)
-        return self._evaluate([best.theta])[0]
+        return self.evaluate([best.theta])[0]
 
     def _climb(self, best: _Trial) -> _Trial:
         """Take scoring steps up to convergence."""
@@ -219,7 +228,7 @@ class _NoiseSearch:
         others = np.log([item.value for item in self._learned])
         for share in INITIAL_SHARES:
             states = np.where(self._first_sd > 0.0, self._first_sd, share * self._scales)
-            (trial,) = self._evaluate([np.concatenate([sensors, np.log(states), others])])
+            (trial,) = self.evaluate([np.concatenate([sensors, np.log(states), others])])
             inside = (trial.w != 0.0) & (np.abs(trial.w) < CLIP)
             mean_square = np.sum(trial.w**2 * inside, axis=0) / np.maximum(np.sum(inside, axis=0), 1)
             sensors = sensors + 0.5 * np.log(np.maximum(mean_square, 1e-6))
@@ -234,7 +243,7 @@ class _NoiseSearch:
         """
         largest = 1.2  # of a logarithm: sizes change by at most a factor of 3.3
         small = 0.01  # of a logarithm, for derivatives
-        near = self._evaluate([best.theta + small * (np.arange(best.theta.size) == index) for index in chosen])
+        near = self.evaluate([best.theta + small * (np.arange(best.theta.size) == index) for index in chosen])
         of_w = np.stack([(trial.w - best.w) / small for trial in near])
         of_d = np.stack([(trial.d - best.d) / small for trial in near])
         counted = np.where(np.abs(best.w) < CLIP, 1.0 / _CUT_MEAN_SQUARE, 0.0)
@@ -252,7 +261,7 @@ class _NoiseSearch:
             predicted = -float(step[chosen] @ (gradient + 0.5 * information @ step[chosen]))
             if predicted < 0.02:
                 break
-            (trial,) = self._evaluate([np.clip(best.theta + step, self._lowest, self._highest)])
+            (trial,) = self.evaluate([np.clip(best.theta + step, self._lowest, self._highest)])
             if trial.loss < best.loss:
                 return trial, predicted if full else -inf
             step, full = 0.4 * step, False
@@ -284,7 +293,7 @@ class _NoiseSearch:
             results += run_together(runs)
         return results
 
-    def _evaluate(self, thetas: Sequence[Array]) -> list[_Trial]:
+    def evaluate(self, thetas: Sequence[Array]) -> list[_Trial]:
         """Evaluate the loss at each theta."""
         return [self._trial(theta, run) for theta, run in zip(thetas, self._run_filters(thetas), strict=True)]
 

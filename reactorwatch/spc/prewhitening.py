@@ -174,6 +174,46 @@ def memory_sds(e: Array, weight: float, doubt: float = 3.0) -> tuple[float, ...]
     return tuple(sds)
 
 
+def memory_covariance(e: Array, correlations: Array, weight: float) -> Array:
+    """Covariance of signals that a chart of their joint average uses, shape (signals, signals).
+
+    Residuals that are white one by one may still be correlated with each other over several rows, as when one
+    disturbance reaches two signals at different times. The covariance of their averages is then
+
+        C(0) + sum over k of (1 - weight)^k (C(k) + C(k)'),
+
+    with C(k) that of rows k apart, in units of weight / (2 - weight). It is summed over the lags that the
+    autoregressions have. A direction keeps the variance of independent rows unless this one is larger than the largest
+    that chance gives in one training of a hundred (Johnstone 2001, On the distribution of the largest eigenvalue in
+    principal components analysis, Annals of Statistics 29).
+
+    Args:
+        e: prewhitened residuals without missing ones, shape (rows, signals).
+        correlations: covariance for independent rows, same shape as the result; positive definite.
+        weight: weight of the newest row in the averages.
+    """
+    rows, count = e.shape
+    freedom = rows / (1.0 + 2.0 * LARGEST_ORDER)  # an average of so few rows has as large an error in its variance
+    if freedom <= count:
+        return correlations
+    root = np.linalg.cholesky(correlations)
+    white = np.linalg.solve(root, (e - e.mean(axis=0)).T)
+    products = white @ white.T / rows
+    for lag in range(1, LARGEST_ORDER + 1):
+        lagged = (1.0 - weight) ** lag * (white[:, lag:] @ white[:, :-lag].T) / rows
+        products += lagged + lagged.T
+    sizes, directions = np.linalg.eigh(products)
+    edge = sqrt(freedom - 1.0) + sqrt(count)
+    spread = edge * (1.0 / sqrt(freedom - 1.0) + 1.0 / sqrt(count)) ** (1.0 / 3.0)
+    chance = (edge**2 + 2.02 * spread) / freedom  # 2.02: of the Tracy-Widom distribution of order 1, at 99 %
+    larger = np.where(sizes > chance, sizes - 1.0, 0.0)
+    if not larger.any():
+        return correlations
+    turned = root @ directions
+    found = correlations + (turned * larger) @ turned.T
+    return np.asarray(0.5 * (found + found.T))
+
+
 WHITENER = np.dtype(
     [
         ("constant", "f8"),

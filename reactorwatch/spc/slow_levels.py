@@ -24,9 +24,12 @@ A stationary process of standard deviation s leaves +-x as often as neighbours l
 
 T being Owen's (1956, Tables for computing bivariate normal probabilities, Ann. Math. Statist. 27) and d the mean square
 of its steps, which the training shows, over s^2; for small d it is the formula of Rice (1944, Mathematical analysis of
-random noise, Bell System Techn. J. 23). The limit x is where the mean of this rate over r is 1 / ARL0.
+random noise, Bell System Techn. J. 23). The limit x is where the mean of this rate over r is 1 / ARL0. Levels that are
+not normal, such as the error of the regression where a plant is not linear, come farther: x is not below that of a
+normal process whose largest level in the rows of the training is the one that came.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -78,6 +81,8 @@ class SlowLevels(NamedTuple):
         variances: variance of the level by memory, shape (memories, p).
         errors: variance of the regression by memory, at the mean, shape (memories, p).
         freedom: degrees of freedom of the innovations' variance.
+        largest: largest size of each level in the training, shape (p,).
+        rows: number of rows of the training.
     """
 
     centres: Array
@@ -88,6 +93,8 @@ class SlowLevels(NamedTuple):
     variances: Array
     errors: Array
     freedom: float
+    largest: Array
+    rows: float
 
     @classmethod
     def of(cls, values: Array, k: int, weight: float) -> Self:
@@ -142,6 +149,8 @@ class SlowLevels(NamedTuple):
             variances,
             errors,
             min(item.freedom for item in chosen),
+            np.max(np.abs(levels[spacing:]), axis=0),
+            float(len(values)),
         )
 
     def rates(self, limits: Array) -> Array:
@@ -150,11 +159,20 @@ class SlowLevels(NamedTuple):
         return crossing_rate(-special.ndtri(np.maximum(beyond, 1e-300)), self.steps / self.variances)
 
     def limits(self, arl0: float) -> Array:
-        """Limit of each average, which is crossed once in `arl0` rows on average over the memories."""
+        """Limit of each level: crossed once in `arl0` rows on average over the memories, or by the largest so far."""
+
+        def normal(limits: Array) -> Array:
+            return crossing_rate(limits / self.sds, self.steps / self.sds**2)
+
+        weighed = self._limits(lambda limits: np.sum(self.weights * self.rates(limits), axis=0), arl0)
+        return np.maximum(weighed, self.largest * self._limits(normal, arl0) / self._limits(normal, self.rows))
+
+    def _limits(self, rates: Callable[[Array], Array], run_length: float) -> Array:
+        """Limits with so many rows to a crossing, at least half a standard deviation."""
         low, high = 0.5 * self.sds, 1e3 * self.sds
         for _ in range(40):
             middle = np.sqrt(low * high)
-            often = np.sum(self.weights * self.rates(middle), axis=0) > 1.0 / arl0
+            often = rates(middle) > 1.0 / run_length
             low, high = np.where(often, middle, low), np.where(often, high, middle)
         return high
 

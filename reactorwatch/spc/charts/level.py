@@ -26,7 +26,7 @@ from reactorwatch.spc.false_alarm_budget import TrainingErrors
 from reactorwatch.spc.slow_levels import FEWEST_SAMPLES, LAGS, InputResponse, SlowLevels, sample_spacing
 from reactorwatch.stored_state import Memory
 
-_INPUTS, _WEIGHT, _LIMIT, _BEFORE, _SLOWEST, _HEAD = range(6)
+_INPUTS, _WEIGHT, LIMIT, _BEFORE, _SLOWEST, _HEAD = range(6)
 
 
 class _Parts(NamedTuple):
@@ -60,7 +60,7 @@ def move(numbers: Array, x: Array) -> float:
     """Take a row into the averages; returns the largest statistic, -1 if the row cannot be taken.
 
     Args:
-        numbers: see `LevelMemory`.
+        numbers: see `LevelMemory`; more may follow.
         x: inputs, then outputs, shape (k + p,).
     """
     k, weight = int(numbers[_INPUTS]), numbers[_WEIGHT]
@@ -97,9 +97,10 @@ def move(numbers: Array, x: Array) -> float:
 _MOVE = Entry(move)
 
 
+@inline
 def count_numbers(inputs: int, outputs: int) -> int:
     """Number of numbers of a chart of so many signals, see `LevelMemory`."""
-    return int(_parts_of(inputs, outputs).end)
+    return _parts_of(inputs, outputs).end
 
 
 class LevelMemory(Memory):
@@ -173,7 +174,7 @@ class Level(ValueChart):
         p, explaining = len(self.names) - k, k * LAGS
         if k < 0 or p < 1 or numbers.size != count_numbers(k, p) or not np.all(np.isfinite(numbers)):
             raise ValueError(f"numbers of {len(self.names)} signals must be finite, got {numbers.tolist()}")
-        self._inputs, self.limit, at = k, float(numbers[_LIMIT]), _parts_of(k, p)
+        self._inputs, self.limit, at = k, float(numbers[LIMIT]), _parts_of(k, p)
         self._centres = numbers[at.centres : at.averages]
         self._averages = numbers[at.averages : at.scales]
         self._scales, self._doubts = numbers[at.scales : at.doubts], numbers[at.doubts : at.gains]
@@ -221,10 +222,18 @@ class Level(ValueChart):
         return Judgement(statistic, 0.0, 0.0, self.limit, statistic > self.limit)
 
     def fill(self, x: Array) -> Array | None:
-        """See `ValueChart`: the average of a missing signal stays as it is."""
-        known, explaining = np.isfinite(x), self._gains.shape[1]
-        newest = np.concatenate([self._averages[:explaining:LAGS], self._averages[explaining:]])
-        return np.where(known, x, self._centres + newest) if known.any() else None
+        """See `ValueChart`: the average of an input stays as it is, that of an output moves as the inputs explain."""
+        known, k, weight = np.isfinite(x), self._inputs, self.memory.numbers[_WEIGHT]
+        if not known.any():
+            return None
+        driving, own = np.split(self._averages, [self._gains.shape[1]])
+        before = driving.reshape(k, LAGS)
+        inputs = np.where(known[:k], x[:k], self._centres[:k] + before[:, 0])
+        after = before.copy()
+        after[:, 0] += weight * (inputs - self._centres[:k] - before[:, 0])
+        after[:, 1:] += weight * 0.25 ** np.arange(LAGS - 1) * (after[:, :1] - before[:, 1:])
+        moved = self._gains @ (after - before).ravel()
+        return np.concatenate([inputs, np.where(known[k:], x[k:], self._centres[k:] + own + moved / weight)])
 
     def explain(self) -> tuple[str, dict[str, float]]:
         """See `ValueChart`: the outputs outside their training, and shares of the squared deviations."""

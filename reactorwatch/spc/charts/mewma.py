@@ -50,6 +50,7 @@ from reactorwatch.spc.charts.base import (
 from reactorwatch.spc.charts.ewma import ewma_run_length
 from reactorwatch.spc.charts.t2 import Whitening, joint_limit, joint_rates, t2_run_length
 from reactorwatch.spc.false_alarm_budget import TrainingErrors
+from reactorwatch.spc.prewhitening import memory_covariance
 from reactorwatch.spc.run_length import (
     MOST_SHIFTED_SIGNALS,
     check_length,
@@ -171,7 +172,8 @@ class Mewma(JointChart):
         weight, sd = baseline.settings["mewma_weight"], np.array(baseline.memory_sd)
         known = mewma_limit(baseline.arl0, sd.size, weight)
         limit = joint_limit(known, weight, baseline.learned, len(baseline.e))
-        return cls(np.zeros(sd.size), correlation(baseline.e) * np.outer(sd, sd), weight, limit)
+        independent = correlation(baseline.e) * np.outer(sd, sd)
+        return cls(np.zeros(sd.size), memory_covariance(baseline.e, independent, weight), weight, limit)
 
     @classmethod
     def relative_rates(cls, baseline: Baseline, errors: TrainingErrors) -> Array:

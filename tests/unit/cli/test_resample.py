@@ -66,9 +66,11 @@ def test_an_export_by_exception_is_watched_resampled_and_the_cure_is_named_witho
     refused = called("backtest", export, *SIGNALS)
     assert refused.returncode == 3
     assert "; --resample auto, or resample in [monitor], makes them regular" in refused.stdout
-    watched = called("backtest", export, *SIGNALS, "--resample", "10 s")
+    watched = called("backtest", export, *SIGNALS, "--resample", "10 s,y=interpolated")
     assert watched.returncode == 0
-    assert "resampled to 10 s: u mean (held between), y mean" in watched.stderr
+    assert "resampled to 10 s: u mean (held between), y interpolated" in watched.stderr
+    assert "no alarms" in watched.stdout
+    assert "not trustworthy" not in watched.stdout
 
 
 def test_a_recording_is_resampled_as_the_table_that_it_was_made_of(

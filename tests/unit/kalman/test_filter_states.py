@@ -159,7 +159,7 @@ def test_the_same_states_are_added_to_a_model_once() -> None:
 
 def test_coloured_noise_has_a_time_constant_that_is_learned() -> None:
     added = ("wander T", "noise T")
-    assert learned_parameters(added) == ("T.memory_min",)
+    assert learned_parameters(cstr(), added) == ("T.memory_min",)
     assert widen_model(cstr(), added, (2.5,)).parameter("T.memory_min").value == 2.5
 
 

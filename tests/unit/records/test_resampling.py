@@ -30,11 +30,12 @@ def table(**signals: tuple[Array, Array]) -> Record:
     return Record(times * S, columns, "export")
 
 
-def reports(values: Array, deadband: float) -> NDArray[np.intp]:
-    """Numbers of the values that are reported by exception."""
+def reports(values: Array, deadband: float, longest: int | None = None) -> NDArray[np.intp]:
+    """Numbers of the values that are reported by exception, or when the longest silence has passed."""
     kept = [0]
     for number, value in enumerate(values):
-        if abs(value - values[kept[-1]]) >= deadband:
+        is_due = longest is not None and number - kept[-1] >= longest
+        if abs(value - values[kept[-1]]) >= deadband or is_due:
             kept.append(number)
     return np.array(kept)
 
@@ -106,10 +107,34 @@ def test_what_is_reported_by_exception_is_held_however_long_it_is_silent() -> No
     np.testing.assert_array_equal(rows.columns["u"], inputs[np.searchsorted(moves, seconds, side="right") - 1])
 
 
-def test_noise_at_random_times_is_not_taken_for_reports_by_exception() -> None:
-    """Two in a hundred at twenty moves are the rate that the binomial distribution gives; records are longer."""
-    rng = np.random.default_rng(4)
-    found = sum(is_by_exception([(np.cumsum(rng.exponential(size=101)), rng.normal(size=101))]) for _ in range(500))
+def wandering(rng: np.random.Generator) -> Array:
+    """First-order autoregression of unit variance with a memory of 65 values."""
+    values = np.zeros(6000)
+    for row, shock in enumerate(rng.normal(scale=np.sqrt(1 - 0.985**2), size=5999)):
+        values[row + 1] = 0.985 * values[row] + shock
+    return values
+
+
+@pytest.mark.parametrize("deadband", [0.2, 0.5])
+@pytest.mark.parametrize("noise", [0.0, 0.05])
+def test_reports_by_exception_are_recognised_also_with_noise_or_a_longest_silence(
+    deadband: float, noise: float
+) -> None:
+    rng = np.random.default_rng(5)
+    for longest in (None, 300):
+        values = wandering(rng) + noise * rng.normal(size=6000)
+        kept = reports(values, deadband, longest)[:400]
+        assert is_by_exception([(kept.astype(float), values[kept])])
+
+
+@pytest.mark.parametrize("resolution", [0.0, 0.1])
+def test_samples_at_random_times_are_not_taken_for_reports_by_exception(resolution: float) -> None:
+    """White noise and one with a long memory: of a hundred records each none, and one by chance."""
+    rng, found = np.random.default_rng(4), 0
+    for values in [rng.normal(size=6000) for _ in range(100)] + [wandering(rng) for _ in range(100)]:
+        at = np.flatnonzero(rng.random(6000) < 0.1)[: rng.integers(60, 400)]
+        shown = np.round(values[at] / resolution) * resolution if resolution else values[at]
+        found += is_by_exception([(at.astype(float), shown)])
     assert found <= 1
 
 

@@ -85,6 +85,31 @@ def driven(rng: np.random.Generator, inputs: Array, lag: float, fall: Array | fl
     return np.column_stack([inputs, 5.0 + 2.0 * follows + 0.3 * wandering(rng, inputs.size, 1)[:, 0] - fall])
 
 
+def test_a_limit_is_not_below_that_of_a_normal_process_with_the_largest_level_of_the_training() -> None:
+    """Independent values: the normal quantiles of both rates, for the true standard deviation of the averages."""
+    rng = np.random.default_rng(13)
+    values = rng.standard_normal((4000, 1))
+    values[2000:2004] += 30.0
+    levels = SlowLevels.of(values, 0, 0.1)
+    assert levels.largest == pytest.approx(30.0 * (1.0 - 0.9**4), rel=0.1)
+    ratio = np.array([levels.limits(run_length)[0] for run_length in (1e4, 1e6)]) / levels.largest
+    step = float((levels.steps / levels.sds**2)[0])
+    for run_length, found in zip((1e4, 1e6), ratio, strict=True):
+        rates = np.array([run_length, 4000.0])
+        exact = np.sqrt(2.0 * np.log(rates * np.sqrt(step) / np.pi))  # of the formula of Rice
+        assert found == pytest.approx(exact[0] / exact[1], rel=0.02)
+
+
+def test_while_an_output_is_missing_its_level_follows_the_inputs() -> None:
+    rng = np.random.default_rng(12)
+    rows = driven(rng, np.repeat(rng.uniform(-1.0, 1.0, 75), 40), 20.0)
+    chart = Level.design(baseline_of(rows[:2000], inputs=1))
+    before = statistics(chart, rows[2000:2500])[-1]
+    rows[2500:2900, 1] = np.nan
+    found = [chart.update(filled).statistic for row in rows[2500:2900] if (filled := chart.fill(row)) is not None]
+    assert np.max(found) / chart.limit < 1.1 * before  # of which the limit's width takes some
+
+
 @pytest.mark.parametrize("lag", [10.0, 25.0, 60.0])
 def test_an_output_that_follows_its_input_to_a_new_level_is_not_outside_and_one_that_falls_is(lag: float) -> None:
     """The input is held at the edge of what it was for 40 times as long as ever in the training."""

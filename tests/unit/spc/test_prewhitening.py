@@ -4,7 +4,10 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from reactorwatch.spc.prewhitening import Prewhitener, Prewhitening, learn
+from reactorwatch.arrays import Array
+from reactorwatch.spc.charts.base import Baseline
+from reactorwatch.spc.charts.mewma import Mewma
+from reactorwatch.spc.prewhitening import Prewhitener, Prewhitening, learn, memory_covariance
 
 
 def autoregression(phi: float, rows: int, seed: int) -> np.ndarray:
@@ -86,3 +89,37 @@ def test_whole_numbers_are_filtered_like_others() -> None:
     filters = [Prewhitener(Prewhitening(0.0, (0.5,), 2.0, 1000, 0.001, 0.001)) for _ in range(2)]
     for z in (1, 2, 3, 1):
         np.testing.assert_equal(filters[0].update(z), filters[1].update(float(z)))
+
+
+def delayed(rows: int, seed: int) -> Array:
+    """Two white signals, of which the second follows the first a row later, with a correlation of 0.9."""
+    first, own = np.random.default_rng(seed).standard_normal((2, rows))
+    return np.column_stack([first[1:], 0.9 * first[:-1] + np.sqrt(1.0 - 0.9**2) * own[1:]])
+
+
+def test_the_covariance_of_averages_has_what_is_correlated_over_rows() -> None:
+    """C(0) + (1 - weight) (C(1) + C(1)') with a correlation of 0.9 at one row."""
+    known = np.array([[1.0, 0.9 * 0.98], [0.9 * 0.98, 1.0]])
+    found = memory_covariance(delayed(100_000, 5), np.eye(2), 0.02)
+    directions = np.array([[1.0, 1.0], [1.0, -1.0]]) / np.sqrt(2.0)
+    assert directions[0] @ found @ directions[0] == pytest.approx(directions[0] @ known @ directions[0], rel=0.02)
+    assert directions[1] @ found @ directions[1] == pytest.approx(1.0, rel=0.02)  # no smaller than for independent rows
+
+
+@pytest.mark.parametrize("signals", [2, 5, 20])
+def test_the_covariance_of_white_signals_is_as_it_is(signals: int) -> None:
+    e = np.random.default_rng(6).standard_normal((20, 2000, signals))
+    kept = [np.array_equal(memory_covariance(item, np.eye(signals), 0.02), np.eye(signals)) for item in e]
+    assert np.count_nonzero(kept) >= 18
+
+
+def test_a_mewma_of_signals_that_follow_each_other_keeps_its_run_length() -> None:
+    """One for independent rows has more than twice as many alarms."""
+    e, count = delayed(2000, 7), 0
+    learned = Prewhitening(0.0, (), 1.0, 100_000, 5e-6, 0.0)
+    chart = Mewma.design(Baseline((learned, learned), e, (1.0, 1.0), 1000.0, 0.001, {"mewma_weight": 0.02}))
+    for row in delayed(400_000, 8):
+        if chart.update(row).out:
+            count += 1
+            chart.restart()
+    assert count < 1.3 * 400

@@ -143,8 +143,9 @@ def test_a_comment_changes_nothing_but_the_comment(room: Room) -> None:
 
 def test_the_list_has_every_alarm_and_publishes_nothing(room: Room) -> None:
     reply = room.ask("list_alarms", ListAlarms())
-    assert [alarm.alarm for alarm in reply.alarms][:5] == ["shewhart/C", "shewhart/T", "ewma/C", "ewma/T", "mewma/all"]
-    assert {alarm.alarm.split("/")[0] for alarm in reply.alarms[5:]} == {"silence", "stuck", "range", "spike", "shift"}
+    charts = ["shewhart/C", "shewhart/T", "ewma/C", "ewma/T", "mewma/all", "level/all"]
+    assert [alarm.alarm for alarm in reply.alarms][:6] == charts
+    assert {alarm.alarm.split("/")[0] for alarm in reply.alarms[6:]} == {"silence", "stuck", "range", "spike", "shift"}
     assert room.published == []
 
 

@@ -8,6 +8,7 @@ import msgspec
 import numpy as np
 import pytest
 from msgspec.structs import replace
+from scipy.signal import lfilter
 
 from benchmarks.harness.plants import INPUTS, KINDS, Kind, simulate
 from monitor_node.config import MonitorConfig
@@ -16,12 +17,14 @@ from monitor_node.learn.process_reference import ProcessMemory, ProcessReference
 from monitor_node.learn.training_diagnosis import DiagnosisJob, Finding, Uncertain, describe_uncertain, find_uncertain
 from monitor_node.learn.training_rows import RowArrays
 from monitor_node.replay import backtest
+from reactorwatch.arrays import Array
 from reactorwatch.contract.codec import Encoded
 from reactorwatch.diagnosis.result import NOMINAL
 from reactorwatch.kalman.ekf_step import NoiseLevels
 from reactorwatch.kalman.filter_states import is_disturbance
 from reactorwatch.process.extended_model import ExtendedModel
 from reactorwatch.process.library.cstr import cstr
+from tests.two_tanks import KEPT, PERIOD_MIN, record_of_two_tanks, two_tanks
 
 from ..samples import samples
 from ..warm_plant import changes, publish
@@ -65,15 +68,46 @@ def test_noise_with_memory_is_coloured_noise(memory: tuple[float, float]) -> Non
     assert disturbances(Kind("noise with memory", noise_memory=memory), 0) == {"noise T"}
 
 
+@cache
+def fit_two_tanks(seed: int, wandering: tuple[bool, bool], resolution: float) -> tuple[Uncertain, Array]:
+    """What the first 1,000 rows show, and the innovations of 9,000 later ones."""
+    record, model = record_of_two_tanks(seed, 10_000, wander=(0.06 * wandering[0], 0.06 * wandering[1])), two_tanks()
+    inputs, measured = (np.column_stack([record.columns[f"{name}{i}"] for i in (1, 2)]) for name in ("F", "h"))
+    measured = np.round(measured / resolution) * resolution if resolution else measured
+    training = RowArrays(record.time_min[:1000], inputs[:1000], measured[:1000])
+    found = find_uncertain(model, model.output_names, training)
+    widened = replace_model(model, uncertain=found.names)
+    reference = ProcessReference.fit(widened, model.output_names, training, [resolution / 12.0**0.5] * 2)
+    return found, reference.run(RowArrays(record.time_min, inputs, measured))[1000:]
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("wandering", [(False, False), (True, False), (False, True), (True, True)])
+def test_inputs_that_wander_are_found_with_their_time_constant(wandering: tuple[bool, bool], seed: int) -> None:
+    found, _ = fit_two_tanks(seed, wandering, 0.0)
+    wander = {f"wander F{i}" for i, is_wandering in enumerate(wandering, start=1) if is_wandering}
+    assert {*filter(is_disturbance, found.names)} == wander
+    assert found.learned == pytest.approx([-PERIOD_MIN / np.log(KEPT)] * len(wander), rel=0.6)
+
+
+@pytest.mark.parametrize("resolution", [0.0, 0.02, 0.05])
+def test_innovations_are_white_together_where_inputs_wander(resolution: float) -> None:
+    """An average of 50 rows of white vectors has the covariance of one row, less its 50th part."""
+    _, z = fit_two_tanks(1, (True, True), resolution)
+    averages = lfilter([0.02], [1.0, -0.98], z, axis=0)[500:]
+    sizes = np.linalg.eigvalsh(np.linalg.solve(np.cov(z.T), np.cov(averages.T) * 1.98 / 0.02).T)
+    assert np.all(sizes < 1.5)
+
+
 def test_a_training_of_few_rows_is_left_as_it_is() -> None:
     rows = RowArrays(np.arange(20.0), np.zeros((20, 1)), np.zeros((20, 2)))
     assert find_uncertain(cstr(), ("C", "T"), rows) == Uncertain()
 
 
 def test_uncertainty_is_stated_in_words() -> None:
-    assert describe_uncertain(("constant volume", "wander T", "noise C")) == (
-        "a disturbance of the balance of T wanders, the noise of C has memory, limits allow for what the training "
-        "leaves open of the constants"
+    assert describe_uncertain(("constant volume", "wander T", "wander qc", "noise C"), ("qc",)) == (
+        "a disturbance of the balance of T wanders, qc wanders about its recorded value, the noise of C has memory, "
+        "limits allow for what the training leaves open of the constants"
     )
 
 

@@ -92,7 +92,7 @@ def test_an_alarm_of_such_a_plant_states_the_rate_of_false_alarms(restless: Watc
 def test_alarms_are_counted_beside_those_promised() -> None:
     run = watched(*leaking_run(0.2, 70.0, 90.0, seed=3), QUICK)
     last = promises(run)[-1]
-    chance = ("shewhart", "ewma", "mewma", "spike", "stuck")
+    chance = ("shewhart", "ewma", "mewma", "level", "spike", "stuck")
     assert last.found == sum(name.split("/")[0] in chance for name, _ in run.raised) > 0
     assert "since, 0.0" in last.text
 
