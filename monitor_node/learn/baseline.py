@@ -37,7 +37,7 @@ from reactorwatch.errors import InputError
 from reactorwatch.identification.structure import Structure
 from reactorwatch.kalman.noise_estimation import resolution_sd
 from reactorwatch.process.model import ProcessModel
-from reactorwatch.spc.prewhitening import Prewhitening, learn
+from reactorwatch.spc.prewhitening import LARGEST_ORDER, Prewhitening, learn
 from reactorwatch.spc.step_test import ROWS as STEP_ROWS
 
 FEWEST_ROWS = 50
@@ -96,6 +96,12 @@ class TrainingResult(NamedTuple):
     after_moves: AfterMoves
     weakness: str
 
+    def widen(self, factor: float, e: Array) -> "TrainingResult":
+        """The same with limits that are wider by a factor, from other prewhitened residuals."""
+        learned = [replace(item, sd=item.sd * factor) for item in self.learned]
+        after_moves = self.after_moves._replace(size=max(self.after_moves.size / factor, 1.0))
+        return self._replace(learned=learned, e=e / factor, after_moves=after_moves)
+
     def excess_rate(self, arl0: float) -> float:
         """Times as many false alarms as promised, by what the training shows of moves of the inputs.
 
@@ -140,13 +146,13 @@ def learn_baseline(
     if not any(evaluated):
         refused = "; ".join(map(": ".join, left_out.items()))
     elif refused and last_chance:
-        none = np.zeros(len(z), dtype=np.bool_)
-        refused, screenings = "", [Screening(known, [], [], none, none) for known in np.isfinite(z).T]
+        refused, screenings = "", _keep_all(z)
     usable = np.column_stack([item.usable for item in screenings]) & np.array(evaluated)
     disturbed = np.column_stack([item.left_out for item in screenings]) | ~np.array(evaluated)
     all_z, z = z, np.where(usable, z, np.nan)
+    order = 0 if reference.errs else LARGEST_ORDER
     learned = [
-        learn(column, sd / typical) if is_evaluated else NOTHING_LEARNED
+        learn(column, sd / typical, order) if is_evaluated else NOTHING_LEARNED
         for column, sd, typical, is_evaluated in zip(z.T, choice.smallest, reference.typical_sd, evaluated, strict=True)
     ]
     e = np.column_stack([_prewhiten(column, item) for column, item in zip(z.T, learned, strict=True)])
@@ -295,8 +301,24 @@ class _Choice:
         is_clean = not any(item.disturbed_intervals or item.outliers for item in screenings)
         if not is_clean and not any(item.refused for item in screenings):
             kept = np.column_stack([item.usable for item in screenings]) | ~np.isfinite(z)
-            reference, z = fit(rows._replace(outputs=np.where(kept, rows.outputs, np.nan)))
+            again = fit(rows._replace(outputs=np.where(kept, rows.outputs, np.nan)))
+            if not (reference.errs and (again[0].errs or _largest_correlation(again[1]) > 0.3)):
+                return _Candidate(*again, screenings)
+        if reference.errs:  # what looks disturbed are its errors
+            screenings = _keep_all(z)
         return _Candidate(reference, z, screenings)
+
+
+def _largest_correlation(z: Array) -> float:
+    """Largest correlation of a residual with that of the row before: about 0 for noise, 0.5 and more for errors."""
+    columns = [np.nan_to_num(column) for column in z.T if np.isfinite(column).any()]
+    return max((float(column[1:] @ column[:-1] / (column @ column)) for column in columns), default=0.0)
+
+
+def _keep_all(z: Array) -> list[Screening]:
+    """Screening of residuals that leaves nothing out."""
+    none = np.zeros(len(z), dtype=np.bool_)
+    return [Screening(known, [], [], none, none) for known in np.isfinite(z).T]
 
 
 def _prewhiten(z: Array, learned: Prewhitening) -> Array:

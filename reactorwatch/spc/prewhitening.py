@@ -56,7 +56,7 @@ class Prewhitening(msgspec.Struct, frozen=True):
         return 1.0 - sum(self.coefficients)
 
 
-def learn(z: Array, smallest_sd: float) -> Prewhitening:
+def learn(z: Array, smallest_sd: float, largest_order: int = LARGEST_ORDER) -> Prewhitening:
     """Learn the autoregression of a residual, its order by Akaike's criterion, at least 1.
 
     The order is never 0: even an insignificant correlation changes the run length of a chart with a long memory, and a
@@ -65,9 +65,10 @@ def learn(z: Array, smallest_sd: float) -> Prewhitening:
     Args:
         z: shape (n,), by time; NaN where missing or to be ignored.
         smallest_sd: lower bound of sigma.
+        largest_order: largest number of coefficients; 0: the residual is no noise, and only its size is learned.
     """
     known = int(np.count_nonzero(np.isfinite(z)))
-    largest = min(LARGEST_ORDER, known // 10 - 1)
+    largest = min(largest_order, known // 10 - 1)
     fits = []
     if largest >= 1:
         lagged = np.column_stack([z[largest - lag : z.size - lag] for lag in range(largest + 1)])
