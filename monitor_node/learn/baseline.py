@@ -266,7 +266,9 @@ class _Choice:
                 self.weakness = black_box.reference.weakness  # ARX models know no better how the plant follows
                 if wanted == "black-box" or (not self.weakness and _predicts_as_well(black_box, identified)):
                     return black_box
-        return identified
+        if self._config.has_values_only:  # the models stay as fitted
+            return identified
+        return self._fit(lambda rows: (models, arx_fit.fit_models(models, rows, to_judge=True)), self.given)
 
     def _fit_equations(self, model: ProcessModel) -> _Candidate | None:
         """Fit the filter of a process model; None if too many values are impossible: it is another process."""
