@@ -119,7 +119,8 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
             training adjusts them.
         units: unit by signal, as its process describes it: that of samples which name none, and, without equations,
             the unit in which a signal is judged.
-        order: order of the ARX models.
+        order: order of the ARX models; None: 3, and where they judge, that of the least error on rows of the training
+            that the fit has not seen.
         delay: delay of the inputs in rows, of all or by input; with 1 they act on the next row. None: 1, unless
             residuals of the training show a dead time.
         forgetting: forgetting factor of the adaptive model, in [0.5, 1]; with 1 it forgets nothing.
@@ -170,7 +171,7 @@ class MonitorConfig(_OfCharts, frozen=True, forbid_unknown_fields=True):
     resolution: dict[str, float] = msgspec.field(default_factory=dict)
     uncertain: dict[str, float] = msgspec.field(default_factory=dict)
     units: dict[str, str] = msgspec.field(default_factory=dict)
-    order: Annotated[int, msgspec.Meta(ge=1, le=20)] = 3
+    order: Annotated[int, msgspec.Meta(ge=1, le=20)] | None = None
     delay: Annotated[int, msgspec.Meta(ge=1, le=100)] | dict[str, int] | None = None
     forgetting: Annotated[float, msgspec.Meta(ge=0.5, le=1.0)] = 0.999
     training_min: Annotated[float, msgspec.Meta(ge=1e-3, le=1e6)] | None = None

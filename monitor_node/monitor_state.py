@@ -66,7 +66,7 @@ def _digest(body: bytes) -> bytes:
 NOT_LEARNED_BY = frozenset({"process", "state_file", "state_every_s", "health_period_s", "diagnose_training"})
 """Settings that do not change what was learned; the model is identified by its equations, not by its file."""
 
-TRAINING = ("training_min", "training_rows")
+TRAINING = ("training_min", "training_rows", "order")
 """Settings that are compared only where they are stated."""
 
 

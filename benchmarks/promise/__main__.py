@@ -1,6 +1,6 @@
 """`make promise`: false alarms on sound plants that are not quite the model, and faults seen on such plants.
 
-python -m benchmarks.promise [--only plants|black-box|faults|statements|foreign|slow] [--results FILE] [--jobs N]
+python -m benchmarks.promise [--only plants|black-box|faults|statements|foreign|slow|arx] [--results FILE] [--jobs N]
 """
 
 import argparse
@@ -9,14 +9,14 @@ from collections.abc import Callable, Sequence
 
 from benchmarks.harness.plants import FLOWS, KINDS, NOISE_SD
 from benchmarks.harness.study import Pool, add_options
-from benchmarks.promise import black_box, foreign_plants, slow, statements
+from benchmarks.promise import arx, black_box, foreign_plants, slow, statements
 from benchmarks.promise.not_quite import print_plants
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__)
-    names = ("plants", "black-box", "faults", "statements", "foreign", "slow")
+    names = ("plants", "black-box", "faults", "statements", "foreign", "slow", "arx")
     parser.add_argument("--only", choices=names, help="one of the tables")
     parser.add_argument("--kinds", type=int, default=len(KINDS), help="number of kinds of plants")
     parser.add_argument("--seeds", type=int, help="records of each kind (6), runs of each fault (3), or sets (1)")
@@ -38,6 +38,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             lambda: statements.print_tables(pool, options.plants, options.runs),
         ),
         "foreign": ("Plants of others", lambda: foreign_plants.print_tables(pool, options.seeds or 1)),
+        "arx": ("RLS ARX beside plain ARX", lambda: arx.print_table(pool, options.seeds or 4)),
         "slow": ("Slow changes", lambda: slow.print_tables(pool, options.seeds or 1)),
     }
     for name, (title, print_table) in tables.items():

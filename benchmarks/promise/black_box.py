@@ -45,6 +45,7 @@ class Result(NamedTuple):
     expected: float  # number of false alarms promised
     rows: int  # number of rows after the training
     judged: int  # number of these that were judged
+    can_keep: float  # number of false alarms that the monitor states instead
     kept: bool  # false if the monitor says that the promise is not kept
 
 
@@ -56,14 +57,9 @@ def watch(job: Job) -> Result:
         publications = monitor.on_message(message, 0)
         alarms += sum(isinstance(item.message, Alarm) and item.message.event == "raised" for item in publications)
     rows, promise = monitor.pipeline.evaluation.memory.rows_watched, monitor.promise
-    kept = promise is None or promise.kept
-    return Result(
-        alarms,
-        monitor.pipeline.baselines.expected_false_alarms,
-        rows,
-        rows - unfamiliar_rows(monitor),
-        kept,
-    )
+    kept, expected = promise is None or promise.kept, monitor.pipeline.baselines.expected_false_alarms
+    excess = 1.0 if promise is None else promise.can_keep_per_30_days / promise.expected
+    return Result(alarms, expected, rows, rows - unfamiliar_rows(monitor), expected * excess, kept)
 
 
 def unfamiliar_rows(monitor: Monitor) -> int:
@@ -86,16 +82,17 @@ def jobs_of(seeds: int, reference: ReferenceName, noises: Sequence[str], inputs:
 
 def print_table(pool: Pool, jobs: Sequence[Job]) -> None:
     """Watch records, and print a line for each noise and input, and one for each noise."""
-    print(head("noise", "input", "false alarms", "promised", "ratio (95 %)", "not kept", "rows judged"))
+    print(head("noise", "input", "false alarms", "promised", "ratio (95 %)", "not kept", "stated", "rows judged"))
     found = list(zip(jobs, pool.run("black boxes", watch, jobs), strict=True))
     for noise in dict.fromkeys(job.noise for job in jobs):
         own = [(job, result) for job, result in found if job.noise == noise]
         for inputs in dict.fromkeys(job.inputs for job, _ in own):
             print(_line(noise, inputs, [result for job, result in own if job.inputs == inputs]))
         print(_line(noise, "all", [result for _, result in own]))
-        kept = [result for _, result in own if result.kept]
-        if 0 < len(kept) < len(own):
-            print(_line(noise, "all that are said to be kept", kept), flush=True)
+        for is_kept, text in ((True, "all that are said to be kept"), (False, "all that are said not to be kept")):
+            some = [result for _, result in own if result.kept == is_kept]
+            if 0 < len(some) < len(own):
+                print(_line(noise, text, some), flush=True)
 
 
 def _line(noise: str, inputs: str, found: Iterable[Result]) -> str:
@@ -105,7 +102,8 @@ def _line(noise: str, inputs: str, found: Iterable[Result]) -> str:
     ratio = f"{alarms / expected:.2f} ({low:.2f} to {high:.2f})"
     broken = f"{sum(not item.kept for item in results)} of {len(results)}"
     judged = sum(item.judged for item in results) / sum(item.rows for item in results)
-    return line(noise, inputs, alarms, f"{expected:.2f}", ratio, broken, f"{100 * judged:.1f} %")
+    stated = f"{sum(item.can_keep for item in results):.1f}"
+    return line(noise, inputs, alarms, f"{expected:.2f}", ratio, broken, stated, f"{100 * judged:.1f} %")
 
 
 class FaultJob(NamedTuple):

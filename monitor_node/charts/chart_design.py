@@ -62,10 +62,11 @@ class ChartDesign:
         chosen: charts that are made, by name.
         evaluated: for each output, True if it is evaluated.
         signals: signals of the charts of values.
+        is_identified: True if identified models predict.
     """
 
     def __init__(self, config: MonitorConfig) -> None:
-        self._config = config
+        self._config, self.is_identified = config, False
         self.names = list[str](dict.fromkeys(name for name, _ in alarm_names(config)))
         self.chosen: list[str] = []
         self.evaluated: list[bool] = []
@@ -117,7 +118,7 @@ class ChartDesign:
         """Baseline of charts of residuals; arguments as for `relative_rates`."""
         config = self._config
         p = false_alarm_budget.point_probability(arl0, config.raise_count, config.window)
-        sds = memory_sds(e, config.chart_settings["ewma_weight"])
+        sds = memory_sds(e, config.chart_settings["ewma_weight"], 0.0 if self.is_identified else 3.0)
         return Baseline(tuple(learned), e, sds, arl0, p, config.chart_settings)
 
     def value_baseline(self, values: Array, arl0: float) -> ValueBaseline:

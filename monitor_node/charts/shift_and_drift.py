@@ -26,7 +26,7 @@ from monitor_node.charts.chart_design import ALL
 from monitor_node.charts.charts import chart_point
 from monitor_node.config import MonitorConfig
 from monitor_node.ingest.alignment import MeasuredRow
-from monitor_node.learn.arx import JUDGING_FORGETTING, ArxPredictor, arx_structure
+from monitor_node.learn.arx import JUDGING_FORGETTING, ArxPredictor, arx_structure, judging_structures
 from monitor_node.learn.arx_fit import start_drift_chart
 from reactorwatch.arrays import Array
 from reactorwatch.contract import keys
@@ -191,11 +191,13 @@ def preparation(config: MonitorConfig, *, wanted: bool) -> Iterator[None]:
     """Compute what the limits take seconds for, step by step: no row waits for it at the end of the training."""
     if not (wanted or ParameterT2.name in config.charts):
         return
-    memory, judging = config.forgetting, max(config.forgetting, JUDGING_FORGETTING)
-    # The adaptive models have a longer memory where they judge, which the training decides if the settings do not.
-    memories = {"arx": [judging], "auto": [memory, judging]}.get(config.reference, [memory])
-    for forgetting in dict.fromkeys(memories):
-        yield from prepare_limit(arx_structure(config).parameters, adaptive_weight(forgetting))
+    # The adaptive models have a longer memory, and other orders, where they judge; the training decides whether they do
+    # if the settings do not.
+    beside = [(arx_structure(config).parameters, config.forgetting)]
+    forgetting = max(config.forgetting, JUDGING_FORGETTING)
+    judging = [(structure.parameters, forgetting) for structure in judging_structures(config)]
+    for parameters, memory in {"arx": judging, "auto": beside + judging}.get(config.reference, beside):
+        yield from prepare_limit(parameters, adaptive_weight(memory))
 
 
 class DriftWatch:

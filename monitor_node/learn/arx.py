@@ -9,9 +9,10 @@ one. They serve any plant, but only within the inputs of their training; other r
 
 Where the adaptive model judges, it starts from the fitted one, and learns while nothing is wrong: not from a row whose
 residual is beyond `GATE` standard deviations, and not while an alarm is active. It forgets a row after `MEMORY` others,
-and the training counts as so many: a model that learned faster would learn a fault before the charts see it. What it
-learned shortly before an alarm is taken back: its state becomes that of a copy that is `COPY_ROWS` to twice as many
-rows old.
+and the training counts as at least so many: a model that learned faster would learn a fault before the charts see it.
+What it learned shortly before an alarm is taken back: its state becomes that of a copy that is `COPY_ROWS` to twice as
+many rows old. The variance of a residual grows with the leverage of its row, by which the parameters are uncertain, and
+more where the errors of held-out rows of the training do.
 
 Where the rows of many signals need predictions for the signal checks only, the models judge as fitted, and one product
 of matrices predicts all outputs: a call for each output would cost more than all else.
@@ -41,17 +42,32 @@ from reactorwatch.spc.charts.base import Judgement
 from reactorwatch.spc.charts.parameters import ParameterT2
 from reactorwatch.stored_state import Memory, copy_of
 
-MEMORY = 10_000
-"""Rows after which an adaptive model that judges has forgotten a row."""
+MEMORY = 2_000
+"""Rows after which an adaptive model that judges has forgotten a row. With 400, a leak of a tenth of the coolant is
+learned before the charts see it; with 10,000, nonlinear plants raise alarms at each new set point for days."""
 
 JUDGING_FORGETTING = 1.0 - 1.0 / MEMORY
 """Least forgetting factor of an adaptive model that judges."""
 
 
+ORDERS = (20, 8)
+"""Orders among which a training chooses beside the usual one: noise of measurement makes the equation of an output
+long, and so do dead times, and the largest order of the settings is as long as the usual training determines."""
+
+
 def arx_structure(config: MonitorConfig) -> Structure:
-    """Structure of the identified models that the settings ask for."""
+    """Structure of the identified models that the settings ask for, or the usual one."""
     delay = tuple(config.delay[name] for name in config.inputs) if isinstance(config.delay, dict) else config.delay
-    return Structure.of_order(config.order, delay or 1, inputs=len(config.inputs))
+    return Structure.of_order(config.order or 3, delay or 1, inputs=len(config.inputs))
+
+
+def judging_structures(config: MonitorConfig) -> list[Structure]:
+    """Structures among which the training chooses where the models judge, the largest first."""
+    usual = arx_structure(config)
+    if config.order is not None or config.has_values_only:
+        return [usual]
+    others = [Structure.of_order(order, usual.delay, usual.inputs) for order in ORDERS]
+    return sorted([usual, *others], key=lambda item: -item.parameters)
 
 
 def simpler_structures(structure: Structure) -> Iterator[Structure]:
@@ -140,6 +156,8 @@ class ArxPredictor(Memory, dict=True):
         copies: the older and the newer copy of an adaptive model that judges; empty where it does not.
         copied_rows: rows since the newer one.
         learning: False while an adaptive model that judges does not learn.
+        leverage_gain: variance of a residual per unit of its row's leverage, in units of that without leverage: 1 for
+            a plant that the model describes, more for others.
         weight: rows for which a row of the training counts in an adaptive model that judges.
     """
 
@@ -156,14 +174,17 @@ class ArxPredictor(Memory, dict=True):
     copies: list[RlsMemory] = msgspec.field(default_factory=list)
     copied_rows: int = 0
     learning: bool = True
+    leverage_gain: float = 0.0
     weight: float = 1.0
 
     def __post_init__(self) -> None:
         self.fitted_rows: Rows | None = None
         """Scaled rows to which the fitted model was fitted, until there is a drift chart."""
         self.extrapolation_sd = 1.0
-        """Standard deviation of the newest residual as a multiple of the usual one: what inputs beyond their range in
-        the training add to the prediction counts as uncertain as it is large."""
+        """Standard deviation of the newest residual with what inputs beyond their range in the training add to the
+        prediction: it counts as uncertain as it is large."""
+        self.sd = 1.0
+        """Standard deviation of the newest residual, in units of that of rows without leverage."""
         if self.scaling is not None:
             self._scale(self.scaling)
 
@@ -190,6 +211,7 @@ class ArxPredictor(Memory, dict=True):
         scales = zip(inputs, self._input_scales, strict=False)  # all inputs, or none of a simpler structure
         regressor = self.lagged.update([(u - middle) / size for u, (middle, size) in scales], scaled)
         if regressor is None:
+            self.sd = self.extrapolation_sd = 1.0
             return nan
         if self.copies:
             prediction = self._learn_carefully(regressor, scaled)
@@ -239,7 +261,9 @@ class ArxPredictor(Memory, dict=True):
     def _learn_carefully(self, regressor: Array, scaled: float) -> float:
         """Learn from a row where nothing is wrong; returns the prediction before."""
         prediction = self.rls.predict(regressor)
-        if self.learning and (scaled - prediction) ** 2 <= GATE**2 * self.rls.noise_variance:
+        variance = 1.0 + self.leverage_gain * self.rls.leverage(regressor)
+        self.sd = sqrt(variance)
+        if self.learning and (scaled - prediction) ** 2 <= GATE**2 * self.rls.noise_variance * variance:
             self.rls.update(regressor, scaled)
             self.copied_rows += 1
             if self.copied_rows == COPY_ROWS:
@@ -248,13 +272,13 @@ class ArxPredictor(Memory, dict=True):
 
     def _extrapolation_sd(self, regressor: Array) -> float:
         if self.ranges is None or self.reference is None:
-            return 1.0
+            return self.sd
         given = regressor[self.input_columns]
         beyond = given - np.clip(given, *self.ranges)
         if not beyond.any():
-            return 1.0
+            return self.sd
         added = float(self.reference[self.input_columns] @ beyond)
-        return sqrt(1.0 + added * added / max(self.rls.noise_variance, 1e-30))
+        return sqrt(self.sd**2 + added * added / max(self.rls.noise_variance, 1e-30))
 
     # --- what is published -----------------------------------------------------------------------------------
 
@@ -312,7 +336,6 @@ class ArxReference(Reference):
 
     def __init__(self, config: MonitorConfig, *, points: bool) -> None:
         self.config, self.points, self.structure = config, points, arx_structure(config)
-        self._sds = [1.0] * len(config.outputs)
         self.predictors: list[ArxPredictor] = []
         self.forget()
 
@@ -327,10 +350,11 @@ class ArxReference(Reference):
         Raises:
             ValueError: the models are of other settings.
         """
+        known = (*judging_structures(self.config), *simpler_structures(self.structure))
         for predictor in predictors:
             found = predictor.structure
             as_set = found if self.config.delay is not None else replace(found, delay=self.structure.delay)
-            if as_set not in (self.structure, *simpler_structures(self.structure)):
+            if as_set not in known:
                 raise ValueError(f"the state must be of {self.structure}, got {predictor.structure}")
         self.predictors[:] = map(copy_of, predictors)
         self.judge_by(ArxMemory())
@@ -371,7 +395,7 @@ class ArxReference(Reference):
     @property
     def typical_sd(self) -> list[float]:
         """See `Reference`."""
-        return self._sds
+        return [1.0] * len(self.predictors)
 
     # --- rows ------------------------------------------------------------------------------------------------
 
@@ -393,7 +417,7 @@ class ArxReference(Reference):
         text = "is beyond its range in the training: the identified model does not hold there"
         self.obstacles = {name: f"rows are not judged while {name} {text}" for name in beyond}
         judged = np.where(self._uses_inputs, nan, predictions).tolist() if beyond else predictions
-        return RowPrediction(judged, self._sds, extrapolation)
+        return RowPrediction(judged, [predictor.sd for predictor in self.predictors], extrapolation)
 
     def restart(self) -> None:
         """See `Reference`; what the models have learned stays."""

@@ -4,12 +4,14 @@ If the training has too few rows for the parameters, the models get a simpler st
 the adaptive model is updated with the rows of the training again.
 """
 
+from collections.abc import Sequence
 from math import nan
 
 import numpy as np
+from msgspec.structs import replace
 
 from monitor_node.ingest.alignment import regular_intervals
-from monitor_node.learn.arx import ArxMemory, ArxPredictor, ArxReference, simpler_structures
+from monitor_node.learn.arx import ArxMemory, ArxPredictor, ArxReference, judging_structures, simpler_structures
 from monitor_node.learn.training_rows import RowArrays
 from reactorwatch.arrays import Array
 from reactorwatch.contract.messages_pb2 import Check, ModelSnapshot, Parameter
@@ -47,20 +49,32 @@ def _learn_again(models: ArxReference, index: int, structure: Structure, rows: R
     return model
 
 
-def fit_models(models: ArxReference, rows: RowArrays) -> Array:
+def fit_models(models: ArxReference, rows: RowArrays, *, to_judge: bool = False) -> Array:
     """Fit each model to a training, with the largest structure that its rows allow.
 
+    Args:
+        models: the models.
+        rows: rows of the training.
+        to_judge: True to choose the orders, for models that judge.
+
     Returns:
-        Residuals, shape (n, outputs), scaled to the size of out-of-sample residuals; NaN if missing. With too few rows
-        for any structure there is no fitted model of the output, and all are NaN.
+        Residuals, shape (n, outputs), scaled to the size of out-of-sample residuals; of models that judge each is that
+        of a fit to the other blocks of the training. NaN if missing. With too few rows for any structure there is no
+        fitted model of the output, and all are NaN.
     """
-    return np.column_stack([_fit_model(models, index, rows) for index in range(len(models.predictors))])
+    return np.column_stack([_fit_model(models, index, rows, to_judge) for index in range(len(models.predictors))])
 
 
-def _fit_model(models: ArxReference, index: int, rows: RowArrays) -> Array:
+def _fit_model(models: ArxReference, index: int, rows: RowArrays, to_judge: bool) -> Array:
     """Fit the model of an output; returns its residuals, shape (n,)."""
     model, outputs, residual = models.predictors[index], rows.outputs[:, index], np.full(rows.time_min.size, nan)
-    structure = _fitting_structure(_with_dead_times(models, model.structure, rows, outputs), rows, outputs)
+    if to_judge:  # the dead times were found before
+        delay = model.structure.delay if model.structure.inputs else models.structure.delay
+        structures = [replace(item, delay=delay) for item in judging_structures(models.config)]
+        structure = _best_structure(structures, rows, outputs)
+        structure = structure or _fitting_structure(replace(models.structure, delay=delay), rows, outputs)
+    else:
+        structure = _fitting_structure(_with_dead_times(models, model.structure, rows, outputs), rows, outputs)
     if structure is not None and structure != model.structure:
         model = _learn_again(models, index, structure, rows)
     scaling = model.scaling
@@ -73,9 +87,15 @@ def _fit_model(models: ArxReference, index: int, rows: RowArrays) -> Array:
     model.reference, model.fitted_rows = theta, scaled
     given = regressors[:, model.input_columns]
     model.ranges = np.array([given.min(axis=0), given.max(axis=0)]) if given.shape[1] else None
-    # With n parameters fitted to N rows, in-sample residuals are sqrt((N - n) / (N + n)) of out-of-sample ones.
-    in_sample = np.sqrt((len(y) - theta.size) / (len(y) + theta.size))
-    residual[scaled.position] = scaling.output_spreads[0] * (y - regressors @ theta) / in_sample
+    if to_judge:
+        held_out, leverage = held_out_residuals(regressors, y)
+        model.leverage_gain = fit_leverage_gain(held_out, leverage)
+        sd = np.sqrt(1.0 + model.leverage_gain * leverage)
+        residual[scaled.position] = scaling.output_spreads[0] * held_out / sd
+    else:
+        # With n parameters fitted to N rows, in-sample residuals are sqrt((N - n) / (N + n)) of out-of-sample ones.
+        in_sample = np.sqrt((len(y) - theta.size) / (len(y) + theta.size))
+        residual[scaled.position] = scaling.output_spreads[0] * (y - regressors @ theta) / in_sample
     if models.points:
         covariance = _covariance(scaled, theta)
         snapshot = _snapshot(model, theta, covariance, float(np.linalg.cond(regressors)), len(y), 1.0)
@@ -95,6 +115,62 @@ def _with_dead_times(models: ArxReference, structure: Structure, rows: RowArrays
     except InputError:  # too few rows, or they do not determine the model
         return structure
     return (better_structure(structure, data) if shown >= WORST_MINUS_LOG10_P else None) or structure
+
+
+def _best_structure(structures: Sequence[Structure], rows: RowArrays, outputs: Array) -> Structure | None:
+    """Structure with the least error on held-out blocks, of those for which the rows suffice; None: of none."""
+    if len(structures) == 1:
+        return None
+    fitting, errors = [], []
+    for structure in structures:
+        found = _consecutive_rows(structure, rows.time_min, rows.inputs, outputs[:, None])
+        if len(found.outputs) < ROWS_A_PARAMETER * structure.parameters:
+            continue
+        sizes = np.maximum(found.regressors.std(axis=0), 1e-12)
+        scaled = (found.regressors - found.regressors.mean(axis=0)) / sizes
+        scaled[:, -1] = 1.0
+        error = np.full(rows.time_min.size, nan)
+        error[found.position] = held_out_residuals(scaled, found.outputs[:, 0] - found.outputs.mean())[0]
+        fitting.append(structure)
+        errors.append(error**2)
+    if not fitting:
+        return None
+    columns = np.column_stack(errors)
+    return fitting[int(np.argmin(columns[np.isfinite(columns).all(axis=1)].mean(axis=0)))]
+
+
+def held_out_residuals(regressors: Array, y: Array) -> tuple[Array, Array]:
+    """Residuals of each of ten blocks by the least-squares fit to the others, and the leverages of its rows.
+
+    With the hat matrix H of the fit to all, the residuals of a block are (I - H_bb)^-1 times those of that fit, and
+    their variances by the error of the other fit, in units of the noise's, the diagonal of (I - H_bb)^-1 - I (Cook &
+    Weisberg 1982, Residuals and Influence in Regression, ch. 3). A ridge of rounding's size keeps a direction that one
+    block alone excites solvable: the others know nothing of it.
+
+    Args:
+        regressors: shape (n, parameters).
+        y: shape (n,).
+    """
+    u, sizes, _ = np.linalg.svd(regressors, full_matrices=False)
+    basis = u * (sizes / np.hypot(sizes, 1e-5 * sizes[0]))
+    residual, leverage = y - basis @ (basis.T @ y), np.empty(len(y))
+    for block in np.array_split(np.arange(len(y)), 10):
+        part = basis[block]
+        passed = np.linalg.solve(np.eye(len(sizes)) - part.T @ part, part.T)
+        leverage[block] = np.einsum("ij,ji->i", part, passed)
+        residual[block] += part @ (passed @ residual[block])
+    return residual, leverage
+
+
+def fit_leverage_gain(residual: Array, leverage: Array) -> float:
+    """Growth of the variance of residuals with their leverage, by the likelihood of normal ones, from 1 to 64.
+
+    It is 1 for a linear plant; where the plant is not, errors of the model grow with the distance from its rows, too.
+    """
+    gains = 2.0 ** np.arange(7)
+    variances = 1.0 + gains[:, None] * leverage
+    badness = np.log(variances).mean(axis=1) + np.log(np.mean(residual**2 / variances, axis=1))
+    return float(gains[np.argmin(badness)])
 
 
 def _fitting_structure(structure: Structure, rows: RowArrays, outputs: Array) -> Structure | None:

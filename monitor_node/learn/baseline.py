@@ -37,7 +37,7 @@ from reactorwatch.errors import InputError
 from reactorwatch.identification.structure import Structure
 from reactorwatch.kalman.noise_estimation import resolution_sd
 from reactorwatch.process.model import ProcessModel
-from reactorwatch.spc.prewhitening import Prewhitening, learn
+from reactorwatch.spc.prewhitening import LARGEST_ORDER, Prewhitening, learn
 from reactorwatch.spc.step_test import ROWS as STEP_ROWS
 
 FEWEST_ROWS = 50
@@ -53,6 +53,12 @@ times as much does not make an interval disturbed."""
 
 NO_VALUE = "no value of it has come"
 """Reason for leaving a signal without values out."""
+
+ERRS = (
+    "the residuals are errors of the black box, not noise: limits follow from the largest of them, and nothing is "
+    "learned after the training"
+)
+"""Remark on a reference that errs."""
 
 NOTHING_LEARNED = Prewhitening(0.0, (), 1.0, FEWEST_ROWS, 0.5 / FEWEST_ROWS, 0.0)
 """Prewhitening of an output that is left out and not evaluated."""
@@ -95,6 +101,12 @@ class TrainingResult(NamedTuple):
     outliers: list[int]
     after_moves: AfterMoves
     weakness: str
+
+    def widen(self, factor: float, e: Array) -> "TrainingResult":
+        """The same with limits that are wider by a factor, from other prewhitened residuals."""
+        learned = [replace(item, sd=item.sd * factor) for item in self.learned]
+        after_moves = self.after_moves._replace(size=max(self.after_moves.size / factor, 1.0))
+        return self._replace(learned=learned, e=e / factor, after_moves=after_moves)
 
     def excess_rate(self, arl0: float) -> float:
         """Times as many false alarms as promised, by what the training shows of moves of the inputs.
@@ -140,13 +152,13 @@ def learn_baseline(
     if not any(evaluated):
         refused = "; ".join(map(": ".join, left_out.items()))
     elif refused and last_chance:
-        none = np.zeros(len(z), dtype=np.bool_)
-        refused, screenings = "", [Screening(known, [], [], none, none) for known in np.isfinite(z).T]
+        refused, screenings = "", _keep_all(z)
     usable = np.column_stack([item.usable for item in screenings]) & np.array(evaluated)
     disturbed = np.column_stack([item.left_out for item in screenings]) | ~np.array(evaluated)
     all_z, z = z, np.where(usable, z, np.nan)
+    order = 0 if reference.errs else LARGEST_ORDER
     learned = [
-        learn(column, sd / typical) if is_evaluated else NOTHING_LEARNED
+        learn(column, sd / typical, order) if is_evaluated else NOTHING_LEARNED
         for column, sd, typical, is_evaluated in zip(z.T, choice.smallest, reference.typical_sd, evaluated, strict=True)
     ]
     e = np.column_stack([_prewhiten(column, item) for column, item in zip(z.T, learned, strict=True)])
@@ -161,6 +173,8 @@ def learn_baseline(
             after_moves = compare_after_moves(np.column_stack(columns), inputs)
     found = {"training": [refused or _screening_summary(outputs, time_min, screenings, evaluated) or "ok"]}
     found[BlackBoxReference.kind] = [weakness] if weakness else []
+    if reference.errs:
+        found[BlackBoxReference.kind].append(ERRS)
     if choice.without_black_box and config.reference == "black-box":
         found[BlackBoxReference.kind].append(f"the ARX models judge: {choice.without_black_box}")
     if reference.is_identified:
@@ -252,7 +266,9 @@ class _Choice:
                 self.weakness = black_box.reference.weakness  # ARX models know no better how the plant follows
                 if wanted == "black-box" or (not self.weakness and _predicts_as_well(black_box, identified)):
                     return black_box
-        return identified
+        if self._config.has_values_only:  # the models stay as fitted
+            return identified
+        return self._fit(lambda rows: (models, arx_fit.fit_models(models, rows, to_judge=True)), self.given)
 
     def _fit_equations(self, model: ProcessModel) -> _Candidate | None:
         """Fit the filter of a process model; None if too many values are impossible: it is another process."""
@@ -293,8 +309,24 @@ class _Choice:
         is_clean = not any(item.disturbed_intervals or item.outliers for item in screenings)
         if not is_clean and not any(item.refused for item in screenings):
             kept = np.column_stack([item.usable for item in screenings]) | ~np.isfinite(z)
-            reference, z = fit(rows._replace(outputs=np.where(kept, rows.outputs, np.nan)))
+            again = fit(rows._replace(outputs=np.where(kept, rows.outputs, np.nan)))
+            if not (reference.errs and (again[0].errs or _largest_correlation(again[1]) > 0.3)):
+                return _Candidate(*again, screenings)
+        if reference.errs:  # what looks disturbed are its errors
+            screenings = _keep_all(z)
         return _Candidate(reference, z, screenings)
+
+
+def _largest_correlation(z: Array) -> float:
+    """Largest correlation of a residual with that of the row before: about 0 for noise, 0.5 and more for errors."""
+    columns = [np.nan_to_num(column) for column in z.T if np.isfinite(column).any()]
+    return max((float(column[1:] @ column[:-1] / (column @ column)) for column in columns), default=0.0)
+
+
+def _keep_all(z: Array) -> list[Screening]:
+    """Screening of residuals that leaves nothing out."""
+    none = np.zeros(len(z), dtype=np.bool_)
+    return [Screening(known, [], [], none, none) for known in np.isfinite(z).T]
 
 
 def _prewhiten(z: Array, learned: Prewhitening) -> Array:

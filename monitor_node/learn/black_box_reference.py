@@ -1,8 +1,12 @@
 """Black box as reference: a state map learned from the training, for plants without equations.
 
-It goes on learning while nothing is wrong: `BlackBoxFilter` forgets a row after about `MEMORY` others. While alarms are
-active it learns nothing, and what it learned shortly before is taken back: its parameters become those of a copy that
-is `COPY_ROWS` to twice as many rows old, so a fault that was not noticed at once is not part of them.
+Where held-out rows of the training show that the residuals are errors of the model rather than noise, as with next to
+no noise, their size is that of held-out rows, limits follow from their peaks (`spc.detection.error_factor`), and
+nothing is learned later: it would be the last errors.
+
+Otherwise it goes on learning while nothing is wrong: `BlackBoxFilter` forgets a row after about `MEMORY` others. While
+alarms are active it learns nothing, and what it learned shortly before is taken back: its parameters become those of a
+copy that is `COPY_ROWS` to twice as many rows old, so a fault that was not noticed at once is not part of them.
 """
 
 from math import inf, nan
@@ -16,8 +20,8 @@ from monitor_node.learn.training_rows import RowArrays
 from reactorwatch.arrays import Array
 from reactorwatch.contract.messages_pb2 import ModelSnapshot, Parameter
 from reactorwatch.errors import InputError
-from reactorwatch.identification.black_box_filter import MEMORY, BlackBoxFilter, BlackBoxFilterMemory
-from reactorwatch.identification.black_box_fit import fit_black_box
+from reactorwatch.identification.black_box_filter import MEMORY, RATE, BlackBoxFilter, BlackBoxFilterMemory
+from reactorwatch.identification.black_box_fit import fit_black_box, held_out_residuals
 from reactorwatch.identification.black_box_model import BlackBoxModel
 from reactorwatch.kalman.batch import GATE
 from reactorwatch.process.model import ProcessModel
@@ -29,6 +33,13 @@ UNFAMILIAR = {
 }
 """Obstacle once there was a row at an unfamiliar point of operation."""
 
+LARGEST_BY_NOISE = 1.1
+"""Size of held-out residuals in standard deviations up to which noise explains them: 1.00 to 1.05 with noise, 1.2 to 2
+without (records of `make promise`, other seeds)."""
+
+LARGEST_ERROR = 3.24
+"""Standard deviations that the largest held-out error of a model has, as the largest of 1,000 normal values."""
+
 
 class BlackBoxMemory(Memory, tag="black-box"):
     """Memory of a `BlackBoxReference`.
@@ -38,6 +49,7 @@ class BlackBoxMemory(Memory, tag="black-box"):
         outputs: index of each output of the model among the monitored ones.
         count: number of monitored outputs.
         period_min: sampling period of the training.
+        error_scale: ratio of the model's standard deviations to those of its fit; 0 where noise explains the residuals.
         typical_sd: median standard deviation of each residual in the training, in the outputs' units; 1 if unknown.
         filter: memory of the filter; None: a new one.
         time_min: time of the newest row; None before the first.
@@ -52,6 +64,7 @@ class BlackBoxMemory(Memory, tag="black-box"):
     count: int
     period_min: float
     typical_sd: list[float]
+    error_scale: float = 0.0
     filter: BlackBoxFilterMemory | None = None
     time_min: float | None = None
     last_inputs: tuple[float, ...] = ()
@@ -83,6 +96,8 @@ class BlackBoxReference(FilterReference):
         self._memory, self.model = memory, memory.model
         self._filter = BlackBoxFilter(memory.model, memory.filter)
         memory.filter = self._filter.memory
+        if memory.error_scale:
+            self._filter.constants[RATE] = 0.0
         self._outputs, self._count, self.period_min = memory.outputs, memory.count, memory.period_min
         if memory.unfamiliar_rows:
             self.obstacles = UNFAMILIAR
@@ -107,7 +122,8 @@ class BlackBoxReference(FilterReference):
             delay: delay of the inputs in rows.
 
         Returns:
-            The reference, and the normalised residuals, scaled to the size of out-of-sample residuals; NaN if missing.
+            The reference, and the normalised residuals, scaled to the size of out-of-sample residuals, or those of
+            held-out blocks if they are errors of the model; NaN if missing.
 
         Raises:
             InputError: there are too few rows or too many signals, or no output varies.
@@ -121,7 +137,20 @@ class BlackBoxReference(FilterReference):
         model = fit_black_box(inputs, measured[:, outputs], follows, smallest, delay)
         period_min, count = float(np.median(np.diff(time_min))), measured.shape[1]
         reference = cls(BlackBoxMemory(model, outputs, count, period_min, [1.0] * count))
-        residuals, sds = reference._filter.run(inputs, evaluated[:, outputs], follows)
+        known = evaluated[:, outputs]
+        residuals, sds = reference._filter.run(inputs, known, follows)
+        held_out, held_out_sds = held_out_residuals(model, (inputs, measured[:, outputs], follows), known, smallest)
+        fitted = np.isfinite(measured[:, outputs]) & np.isfinite(held_out)
+        squares = np.sum(np.square(held_out), axis=0, where=fitted) / np.maximum(np.sum(fitted, axis=0), 1)
+        if squares.max() > LARGEST_BY_NOISE**2:
+            scale = float(np.nanmax(np.abs(held_out))) / LARGEST_ERROR
+            residuals, sds = held_out * held_out_sds, held_out_sds * scale
+            reference = cls(
+                BlackBoxMemory(model.scale_sds(scale), outputs, count, period_min, [1.0] * count, error_scale=scale)
+            )
+            reference._filter.run(inputs, known, follows)
+            reference._filter.learning = False
+            reference._filter.limit_sd = 1.3 * np.nanquantile(sds, 0.99, axis=0) / model.spreads[: len(outputs)]
         for output, column in zip(outputs, sds.T, strict=True):
             if np.isfinite(column).any():
                 reference.typical_sd[output] = float(np.nanmedian(column))
@@ -174,14 +203,14 @@ class BlackBoxReference(FilterReference):
         return z
 
     @property
+    def errs(self) -> bool:
+        """See `Reference`."""
+        return self._memory.error_scale > 0.0
+
+    @property
     def weakness(self) -> str:
         """See `Reference`."""
-        if self.model.error_ratio > 2.0:  # 1 or 2 where the form of the model is right
-            return (
-                "the black box is off by more than the noise where it was not fitted: at inputs that the training had "
-                "rarely, false alarms may be more than promised; train over more set points, or give the equations"
-            )
-        if self.model.dynamics_sd <= 0.2:
+        if self.errs or self.model.dynamics_sd <= 0.2:  # errors of a model that errs are known from held-out blocks
             return ""
         return (
             "the training moved the plant too little to determine its dynamics: at new set points false alarms may be "
@@ -196,7 +225,7 @@ class BlackBoxReference(FilterReference):
 
     def set_learning(self, learning: bool) -> None:
         """Learn from the rows to come or not; the end of learning takes back what was learned last."""
-        if learning == self._filter.learning:
+        if learning == self._filter.learning or self.errs:  # what a model that errs would learn is its last errors
             return
         self._filter.learning = learning
         if not learning:
@@ -257,8 +286,8 @@ class BlackBoxReference(FilterReference):
 
     def is_ordinary(self, time_min: float) -> bool:
         """True if a compiled step may take the row after the one of this time."""
-        is_whole = len(self._outputs) == self._count
-        return is_whole and self._filter.memory.started and self._filter.learning and self._memory.time_min == time_min
+        is_whole, is_usual = len(self._outputs) == self._count, self._filter.learning != self.errs
+        return is_whole and is_usual and self._filter.memory.started and self._memory.time_min == time_min
 
     @property
     def numbers(self) -> tuple[Array, Array]:

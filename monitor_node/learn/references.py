@@ -106,6 +106,11 @@ class Reference(ABC):
         """Learn from the rows to come, or not: while nothing is wrong, or a fault would be learned as ordinary."""
 
     @property
+    def errs(self) -> bool:
+        """True if the residuals of held-out blocks are errors of the model: limits then follow from their peaks."""
+        return False
+
+    @property
     def weakness(self) -> str:
         """Reason why the promise may not hold at set points that the training has not seen; empty if it does."""
         return ""

@@ -8,6 +8,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 import msgspec
+import numpy as np
 
 from monitor_node.alarms.annunciator import Annunciator
 from monitor_node.causes.stage import Suspicion, SuspicionMemory, has_causes
@@ -39,6 +40,7 @@ from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MINUTE_NS
 from reactorwatch.spc import false_alarm_budget
 from reactorwatch.spc.charts.parameters import ParameterT2
+from reactorwatch.spc.detection import error_factor
 from reactorwatch.spc.false_alarm_budget import TrainingErrors
 from reactorwatch.spc.level_change import LevelChange
 from reactorwatch.spc.prewhitening import Prewhitener, Prewhitening
@@ -178,6 +180,7 @@ class Evaluation:
     def start(self, trained: TrainingResult, period_ns: float, *, again: bool) -> None:
         """Start to evaluate rows, or `again` by another model: the drift of the identified models then goes on."""
         self._leave_out(trained.left_out)
+        self.charts.design.is_identified = trained.reference.is_identified
         unmade = self.charts.design.choose(self.evaluated, trained.e, trained.values)
         self.shift.is_active = trained.responses is not None and not self._config.has_values_only
         trained.checks.extend(
@@ -185,7 +188,7 @@ class Evaluation:
         )
         period_min = period_ns / MINUTE_NS
         arl0 = self._share_budget(period_min, trained.checks)
-        memory = self.memory
+        memory, trained = self.memory, self._widen(trained, arl0)
         memory.checks, memory.arl0 = trained.checks, arl0
         self._set_reference(trained.reference, trained.learned)
         for whitener, item in zip(self.whiteners, trained.learned, strict=True):
@@ -203,11 +206,25 @@ class Evaluation:
             self.notes += self.drift.start(self.models.predictors, self.evaluated, arl0)
         self.notes += [f"training: {check.result}" for check in trained.checks if check.result != "ok"]
 
+    def _widen(self, trained: TrainingResult, arl0: float) -> TrainingResult:
+        """Training with wider limits, where the reference errs.
+
+        Correlations of such errors do not last: charts of all outputs are made from rows that have none, as each output
+        has those of another time.
+        """
+        if not trained.reference.errs:
+            return trained
+        rows, outputs = trained.e.shape
+        e = np.column_stack([np.roll(column, i * rows // outputs) for i, column in enumerate(trained.e.T)])
+        detectors = self.charts.design.detectors(trained.learned, e, arl0)
+        return trained.widen(error_factor(trained.e, detectors, arl0), e)
+
     def check_training(
         self, trained: TrainingResult, model: ProcessModel | None, period_ns: float, units: Sequence[str]
     ) -> None:
         """Judge the training by itself, and state the power of the watch that has started with it."""
         watch: Watch | None = None
+        trained = self._widen(trained, self.memory.arl0)
         if self.promises.states_power:
             watch = Watch(
                 self._config,

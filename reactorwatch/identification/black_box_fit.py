@@ -9,17 +9,14 @@
 3. The variances of process and measurements maximise the likelihood of the filter (`log_likelihood`).
 4. The number of lags is that of the largest likelihood less half the effective parameters times the logarithm of the
    rows (Schwarz, Ann. Statist. 6 (1978) 461). Then one degree more is tried by Akaike's criterion, with a margin.
-5. The covariance of the parameters is that of a model that is right, whose errors are white noise. A polynomial is not
-   the plant, and with little noise its error is what remains. So each block of the rows is predicted by a fit to the
-   others; the ratio by which the parameters' standard deviations have to be larger for the likeliest predictions is the
-   model's `error_ratio`.
+5. With little noise what remains is the error of the polynomial, which is larger where it was not fitted. So rows of
+   the training are predicted by fits to the others (`held_out_residuals`).
 """
 
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from math import inf
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -140,60 +137,70 @@ def fit_black_box(
             f"{ROWS_A_PARAMETER * (1 + count + inputs.shape[1])} complete rows in succession and at most "
             f"{MOST_PARAMETERS} parameters, got {len(y)} rows"
         )
-    return _with_error_ratio(best[2], (inputs, outputs, follows), (y, u, smallest))
+    return best[2]
 
 
 BLOCKS = 5
 """Blocks of the training, as in the other cross-validations of a training (`spc.charts.value_chart`)."""
 
 
-def _with_error_ratio(
-    model: BlackBoxModel, rows: tuple[Array, Array, NDArray[np.bool_]], scaled: tuple[Array, Array, Array]
-) -> BlackBoxModel:
-    """The model with its error ratio; see the fifth step of the module.
+OUTERMOST = 0.01
+"""Share of the rows with the least values of an output, and of those with the largest, that are held out: as far beyond
+the others as the values of a watch that is a hundred times as long are beyond those of the training, if tails are
+exponential."""
+
+
+def held_out_residuals(
+    model: BlackBoxModel, rows: tuple[Array, Array, NDArray[np.bool_]], evaluated: Array, smallest_sd: Array
+) -> tuple[Array, Array]:
+    """Normalised residuals of rows of the training, predicted by fits to the others: blocks, and outermost values.
+
+    The larger counts.
 
     Args:
         model: the fitted model.
-        rows: inputs, outputs, and flags of rows that follow the row before.
-        scaled: scaled outputs, scaled inputs, and smallest variances of the outputs.
+        rows: inputs, outputs and flags of rows that follow the row before, as they were fitted.
+        evaluated: outputs that are predicted, shape (rows, outputs).
+        smallest_sd: smallest standard deviation of each output's measurements, in its unit.
+
+    Returns:
+        Residuals, and their standard deviations, both of shape (rows, outputs); NaN where there is no prediction.
     """
-    shape, precision = model.shape, np.diag(1.0 / prior_variances(model.shape))
-    (inputs, outputs, follows), (y, u, smallest) = rows, scaled
-    lagged, divisors = lagged_inputs(shape, u), 4.0 ** np.arange(8)  # doubles a standard deviation, up to 128 times
-    likelihoods = np.zeros(divisors.size)
-
-    def with_information(information: Array, theta: Array) -> BlackBoxModel:
-        scaling = np.array(model.centres), np.array(model.spreads)
-        variances, covariance = (np.array(model.r), np.array(model.q)), _inverse(information + precision)
-        return BlackBoxModel.of(shape, model.rows, model.effective, model.gain, scaling, variances, theta, covariance)
-
-    for first, end in pairwise(np.linspace(0, len(y), BLOCKS + 1).astype(int).tolist()):
-        others, joined = y.copy(), follows.copy()
-        others[first:end], joined[first], joined[end : end + 1] = np.nan, False, False
+    shape, (inputs, outputs, follows) = model.shape, rows
+    centres, spreads, count = np.array(model.centres), np.array(model.spreads), model.outputs
+    y, u = (outputs - centres[:count]) / spreads[:count], (inputs - centres[count:]) / spreads[count:]
+    smallest = np.square(np.maximum(smallest_sd / spreads[:count], 1e-6))
+    lagged, variances = lagged_inputs(shape, u), (np.array(model.r), np.array(model.q))
+    z, sds = np.full(outputs.shape, np.nan), np.full(outputs.shape, np.nan)
+    for held in _held_out_rows(y):
+        others, joined = np.where(held[:, None], np.nan, y), follows & (held == np.roll(held, 1))
         kinds = row_kinds(shape, others, lagged, joined)
         fitted = _gauss_newton(shape, Rows(others, lagged, kinds, smallest), model.theta, model.gain, 20)
         if fitted is None:  # the others do not determine the plant
             continue
-        information = np.linalg.inv(fitted.covariance) - precision
-        block = inputs[first:end], outputs[first:end], joined[first:end]
-        likelihoods += [
-            _likelihood_of(with_information(information / divisor, fitted.theta), *block) for divisor in divisors
-        ]
-    return msgspec.structs.replace(model, error_ratio=float(np.sqrt(divisors[np.argmax(likelihoods)])))
+        scaling, parameters = (centres, spreads), (fitted.theta, fitted.covariance)
+        other = BlackBoxModel.of(shape, model.rows, model.effective, model.gain, scaling, variances, *parameters)
+        row_filter = BlackBoxFilter(other)
+        row_filter.learning = False
+        for k in range(len(y)):
+            if not follows[k]:
+                row_filter.restart()
+            predicted = row_filter.update(inputs[k].tolist(), evaluated[k].tolist(), [inf] * count)
+            if predicted is None or not held[k]:
+                continue
+            found, found_sds = (evaluated[k] - predicted.prediction) / predicted.sd, np.array(predicted.sd)
+            larger = ~(np.abs(found) <= np.abs(z[k]))
+            z[k, larger], sds[k, larger] = found[larger], found_sds[larger]
+    return z, sds
 
 
-def _likelihood_of(model: BlackBoxModel, inputs: Array, outputs: Array, follows: NDArray[np.bool_]) -> float:
-    """Log-likelihood of rows by the filter that learns from them, without a constant."""
-    row_filter, unlimited, total = BlackBoxFilter(model), [inf] * model.outputs, 0.0
-    for given, measured, is_next in zip(inputs.tolist(), outputs.tolist(), follows.tolist(), strict=True):
-        if not is_next:
-            row_filter.restart()
-        predicted = row_filter.update(given, measured, unlimited)
-        if predicted is not None:
-            sds = np.array(predicted.sd)
-            errors = (np.array(measured) - predicted.prediction) / sds
-            total -= float(np.nansum(np.log(sds) + 0.5 * errors**2))
-    return total
+def _held_out_rows(y: Array) -> list[NDArray[np.bool_]]:
+    """Flags of the rows that are held out at a time: blocks, and the outermost values, beyond which others will be."""
+    rows, found = np.arange(len(y)), []
+    for first, end in pairwise(np.linspace(0, len(y), BLOCKS + 1).astype(int).tolist()):
+        found.append((first <= rows) & (rows < end))
+    low, high = np.nanquantile(y, (OUTERMOST, 1.0 - OUTERMOST), axis=0)
+    return [*found, *(y < low).T, *(y > high).T]
 
 
 def row_kinds(shape: Shape, y: Array, lagged: Array, follows: NDArray[np.bool_]) -> NDArray[np.int64]:

@@ -88,8 +88,6 @@ class BlackBoxModel(msgspec.Struct, frozen=True):
         r: variances of the measurements of each output.
         q: variances of the process from row to row, of each output.
         numbers: parameters and the lower triangle of their covariance, as doubles.
-        error_ratio: ratio of the errors of the parameters, by blocks of the training that were held out, to their
-            standard deviations, a power of 2; above 2 the model's own error is larger than the noise explains.
     """
 
     outputs: int
@@ -105,7 +103,6 @@ class BlackBoxModel(msgspec.Struct, frozen=True):
     r: tuple[float, ...]
     q: tuple[float, ...]
     numbers: bytes
-    error_ratio: float = 1.0
 
     @classmethod
     def of(
@@ -125,6 +122,13 @@ class BlackBoxModel(msgspec.Struct, frozen=True):
         numbers = pack_numbers(np.concatenate([theta.ravel(), lower]))
         sizes = (shape.outputs, shape.inputs, shape.lags, shape.degree, shape.delay)
         return cls(*sizes, rows, effective, gain, centres, spreads, r, q, numbers)
+
+    def scale_sds(self, factor: float) -> Self:
+        """The same model with standard deviations that are larger by a factor; its predictions are the same."""
+        variances = factor**2 * np.array(self.r), factor**2 * np.array(self.q)
+        scaling = np.array(self.centres), np.array(self.spreads)
+        covariance = factor**2 * self.covariance
+        return self.of(self.shape, self.rows, self.effective, self.gain, scaling, variances, self.theta, covariance)
 
     @property
     def shape(self) -> Shape:

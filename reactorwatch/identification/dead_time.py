@@ -19,7 +19,7 @@ from reactorwatch.arrays import Array
 from reactorwatch.errors import InputError, UnfitRecordError
 from reactorwatch.identification.data import Dataset, rows_of
 from reactorwatch.identification.linear import fit_linear
-from reactorwatch.identification.structure import Delay, Structure
+from reactorwatch.identification.structure import Delay, Scaling, Structure
 
 LONGEST = 25  # rows; the studied dead times end at 20, with 5 to spare
 LAGS = LONGEST + 10  # the response after the longest dead time, whose rest the output's past describes
@@ -75,46 +75,48 @@ def find_dead_times(data: Dataset) -> tuple[int, ...]:
     """Dead time of each input in rows, from 1 to 25.
 
     Raises:
-        InputError: too few complete rows for the regression.
+        InputError: too few complete rows for the regression, or an output that is constant in them.
     """
     count = data.inputs.shape[1]
     data, _ = data.split(min(data.rows, 20_000))  # ten times as many as the studied records: more take memory
     structure = Structure(OUTPUT_LAGS, LAGS, 1, count)
-    rows = rows_of(structure, *data.arrays)
+    scaling = Scaling.of(data.inputs, data.output)
+    rows = rows_of(structure, scaling.inputs(data.inputs), scaling.outputs(data.output), data.time)
     freedom = len(rows.outputs) - structure.parameters
     if freedom <= structure.parameters:
         raise UnfitRecordError(
             f"the search of dead times needs more than {2 * structure.parameters} complete rows in succession, "
             f"got {len(rows.outputs)}: record for longer, or give --delay"
         )
+    if np.ptp(rows.outputs) == 0.0:
+        raise UnfitRecordError("the search of dead times needs an output that varies in complete rows")
     gram, moments = _regression(rows.regressors, rows.outputs[:, 0], count, freedom)
     factors = np.array([[_response_factor(delay, decay) for decay in DECAYS] for delay in range(1, LONGEST + 1)])
     priors = [1e-3**0.5 * factors[0, -2]] * count  # a slow response without dead time, until an input is searched
-    delays, before = [0] * count, [1] * count
-    while delays != before:
+    delays = [0] * count
+    for _ in range(10):  # 2 or 3 passes are usual; an input that one of them leaves undetermined may go to and fro
         before = delays.copy()
         for i in range(count):
             delays[i], priors[i] = _best_response(gram, moments, priors, i, factors)
+        if delays == before:
+            break
     return tuple(delays)
 
 
 def _regression(regressors: Array, target: Array, count: int, freedom: int) -> tuple[Array, Array]:
     """Gram matrix of the lags of the inputs, one input after the other, and their products with the output.
 
-    Both are over the variance of the noise. The past of the output and the offset are projected out, and inputs are
-    scaled to their spread.
+    The past of the output and the offset are projected out; both are over the variance of the noise.
     """
     past = regressors[:, [*range(OUTPUT_LAGS), -1]]
-    lagged = regressors[:, OUTPUT_LAGS:-1].reshape(len(target), LAGS, count).swapaxes(1, 2)
-    spread = np.std(lagged[:, :, 0], axis=0)[:, None]
-    scaled = (lagged / np.where(spread > 0.0, spread, 1.0)).reshape(len(target), -1)
+    lagged = regressors[:, OUTPUT_LAGS:-1].reshape(-1, LAGS, count).swapaxes(1, 2).reshape(len(target), -1)
     q, _ = np.linalg.qr(past)
-    scaled, target = scaled - q @ (q.T @ scaled), (target - q @ (q.T @ target)) / np.std(target)
-    gram, moments = scaled.T @ scaled, scaled.T @ target
+    lagged, target = lagged - q @ (q.T @ lagged), target - q @ (q.T @ target)
+    gram, moments = lagged.T @ lagged, lagged.T @ target
     # the lags of an input held for long are nearly dependent
     solution = np.linalg.lstsq(gram, moments, rcond=1e-11)[0]
-    total = float(target @ target)
-    variance = max(total - float(moments @ solution), 1e-10 * total) / freedom
+    # with less noise than 1e-4 of the spread, differences of the likelihood are lost by rounding
+    variance = max(float(target @ target - moments @ solution) / freedom, 1e-8)
     return gram / variance, moments / variance
 
 

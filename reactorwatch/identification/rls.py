@@ -169,6 +169,21 @@ def update_row(
     return prediction, residual, residual_sd, 1.0 - left
 
 
+@jit
+def solve_leverage(numbers: NDArray[np.float64], work: NDArray[np.float64], regressor: NDArray[np.float64]) -> float:
+    """Leverage of a row to come, phi' A^-1 phi: the squares of R'^-1 phi by D; 0 where no row has resolved anything."""
+    n, total = regressor.size, 0.0
+    entry = 5 * n + SUMS
+    work[:] = regressor
+    for i in range(n):
+        if numbers[2 * n + i] > 0.0:
+            total += work[i] * work[i] / numbers[2 * n + i]
+        for j in range(i + 1, n):
+            work[j] -= numbers[entry] * work[i]
+            entry += 1
+    return total
+
+
 class RlsMemory(Memory):
     """Memory of a recursive estimator.
 
@@ -291,6 +306,10 @@ class RecursiveLeastSquares:
     def predict(self, regressor: ArrayLike) -> float:
         """Predict an output with the present parameters."""
         return float(np.dot(np.asarray(regressor, dtype=np.float64), self._numbers[: self._parameters]))
+
+    def leverage(self, regressor: Array) -> float:
+        """Variance of a prediction by the present parameters, phi' P phi, in units of the noise's."""
+        return float(solve_leverage(self._numbers, self._work, regressor))
 
     def set_parameters(self, parameters: ArrayLike) -> None:
         """Set the parameters, shape (n,), and keep their uncertainty.

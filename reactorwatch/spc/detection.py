@@ -21,6 +21,7 @@ import numpy as np
 from scipy import linalg, special
 
 from reactorwatch.arrays import Array
+from reactorwatch.spc.false_alarm_budget import return_level
 from reactorwatch.spc.run_length import false_alarm_rates
 
 POWER = 0.9
@@ -49,6 +50,29 @@ class Detector(NamedTuple):
     weight: float
     level: float
     rule: tuple[int, int] = (1, 1)
+
+
+def error_factor(e: Array, detectors: Sequence[Detector], arl0: float) -> float:
+    """Times by which limits have to be wider where residuals are errors of a model, by their peaks.
+
+    At least 1, and so much that none of the rows given would have raised an alarm.
+
+    Args:
+        e: prewhitened residuals of held-out rows, shape (rows, signals); NaN where there is none.
+        detectors: the charts.
+        arl0: run length of each chart without a fault, in rows.
+    """
+    single = np.abs(np.nan_to_num(e)) / -special.ndtri(0.5 / arl0)  # as a check for spikes sees them
+    largest = single.max(axis=1)
+    for chart in detectors:
+        values = np.nan_to_num(e[:, list(chart.signals)]) @ chart.matrix.T
+        average = np.linalg.norm(_ewma(values[None, None], chart.weight)[0, 0], axis=1)
+        count, window = chart.rule
+        recent = np.lib.stride_tricks.sliding_window_view(np.concatenate([np.zeros(window - 1), average]), window)
+        violated = np.sort(recent, axis=1)[:, -count]
+        np.maximum(largest, violated / (chart.level * sqrt(chart.weight / (2.0 - chart.weight))), out=largest)
+    # the tails of errors are those of exponential values rather than normal ones: so not their squares
+    return max(return_level(np.sqrt(largest), arl0) ** 2, float(largest.max(initial=1.0)))
 
 
 class _Path(NamedTuple):

@@ -159,6 +159,31 @@ def scale_variance(learned: Prewhitening, weight: float) -> float:
     return learned.sd_variance + (1.0 - weight) ** 2 * learned.passed_variance
 
 
+def return_level(statistics: Array, arl0: float) -> float:
+    """Level that a statistic exceeds once in a number of rows, extrapolated from its peaks; 0 where these are too few.
+
+    The squares of the larger half of the peaks, one a block of 20 rows, are extrapolated exponentially, as those of
+    normal values are (peaks over a threshold: Davison & Smith 1990, Models for exceedances over high thresholds, J.
+    Roy. Statist. Soc. B 52). Where tails are heavier, peaks are larger, and the level follows.
+
+    >>> e = np.abs(np.random.default_rng(0).standard_normal(100_000))
+    >>> round(return_level(e[:10_000], 10_000), 1), round(float(np.sort(e)[-10]), 1)
+    (4.0, 3.9)
+
+    Args:
+        statistics: statistics of the training, shape (rows,); NaN where there is none.
+        arl0: number of rows.
+    """
+    blocks = np.array_split(np.nan_to_num(statistics) ** 2, max(statistics.size // 20, 1))
+    largest = np.sort([float(block.max()) for block in blocks if block.size])
+    upper = len(largest) // 2
+    if upper < 5:  # too few for an estimate of their tail
+        return 0.0
+    threshold, excess = largest[-upper - 1], largest[-upper:] - largest[-upper - 1]
+    scale = float(excess.mean()) * (1.0 + 1.0 / sqrt(upper))
+    return sqrt(threshold + scale * max(0.0, log(arl0 * upper / statistics.size)))
+
+
 # --- errors of the training --------------------------------------------------------------------------------------
 
 

@@ -56,7 +56,7 @@ class Prewhitening(msgspec.Struct, frozen=True):
         return 1.0 - sum(self.coefficients)
 
 
-def learn(z: Array, smallest_sd: float) -> Prewhitening:
+def learn(z: Array, smallest_sd: float, largest_order: int = LARGEST_ORDER) -> Prewhitening:
     """Learn the autoregression of a residual, its order by Akaike's criterion, at least 1.
 
     The order is never 0: even an insignificant correlation changes the run length of a chart with a long memory, and a
@@ -65,9 +65,10 @@ def learn(z: Array, smallest_sd: float) -> Prewhitening:
     Args:
         z: shape (n,), by time; NaN where missing or to be ignored.
         smallest_sd: lower bound of sigma.
+        largest_order: largest number of coefficients; 0: the residual is no noise, and only its size is learned.
     """
     known = int(np.count_nonzero(np.isfinite(z)))
-    largest = min(LARGEST_ORDER, known // 10 - 1)
+    largest = min(largest_order, known // 10 - 1)
     fits = []
     if largest >= 1:
         lagged = np.column_stack([z[largest - lag : z.size - lag] for lag in range(largest + 1)])
@@ -149,7 +150,7 @@ def _sd_variance(error: Array, freedom: int) -> float:
     return max(independent, float(batches.var(ddof=1)) / (4.0 * mean**2 * 10))
 
 
-def memory_sds(e: Array, weight: float) -> tuple[float, ...]:
+def memory_sds(e: Array, weight: float, doubt: float = 3.0) -> tuple[float, ...]:
     """Standard deviation of each signal that charts with a memory use; 1 if its residual is white.
 
     An autoregression of few coefficients may miss a correlation over many rows. It shows in averages: theirs should
@@ -158,6 +159,8 @@ def memory_sds(e: Array, weight: float) -> tuple[float, ...]:
     Args:
         e: prewhitened residuals, shape (rows, signals); NaN where there is none.
         weight: weight of the newest row in the averages.
+        doubt: standard deviations by which a variance has to be larger; 0 where correlation is expected, as of the
+            errors of a linear model, which are alike at one point of operation.
     """
     sds = []
     for column in e.T:
@@ -168,7 +171,7 @@ def memory_sds(e: Array, weight: float) -> tuple[float, ...]:
             squares += average * average
         ratio = squares / max(len(column), 1) * (2.0 - weight) / weight
         independent = max(len(column) * weight / 2.0, 1.0)
-        sds.append(sqrt(ratio) if ratio > 1.0 + 3.0 * sqrt(2.0 / independent) else 1.0)
+        sds.append(sqrt(ratio) if ratio > 1.0 + doubt * sqrt(2.0 / independent) else 1.0)
     return tuple(sds)
 
 

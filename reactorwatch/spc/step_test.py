@@ -20,7 +20,7 @@ The test computes the innovations itself, of all rows: a row that another stage 
 the first row of a step.
 """
 
-from math import log, nan, sqrt
+from math import nan, sqrt
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -29,7 +29,7 @@ from scipy.special import ndtri
 
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.numba_kernel import Entry, jit
-from reactorwatch.spc.false_alarm_budget import widen_limit
+from reactorwatch.spc.false_alarm_budget import return_level, widen_limit
 from reactorwatch.spc.prewhitening import (
     LARGEST_ORDER,
     WHITENER,
@@ -229,8 +229,7 @@ def step_response(residual: Array, learned: Prewhitening) -> Array:
 def design_limit(statistics: Array, learned: Prewhitening, arl0: float) -> float:
     """Limit of the statistic: that of normal innovations, or the one that the training's statistics ask for.
 
-    The squares of the larger half of their peaks, one a block of `ONSETS` rows, are extrapolated exponentially. So are
-    those of normal values; where tails are heavier, as at moves of an input, peaks are larger, and the limit follows.
+    Where tails are heavier than those of normal values, as at moves of an input, the limit follows (`return_level`).
 
     Args:
         statistics: statistics of the training, shape (rows,); NaN where there is none.
@@ -238,11 +237,4 @@ def design_limit(statistics: Array, learned: Prewhitening, arl0: float) -> float
         arl0: run length without a fault, in rows.
     """
     normal = widen_limit(-float(ndtri(0.5 / (arl0 * (ONSETS - FEWEST_LATER)))), 1.0, learned)
-    blocks = np.array_split(np.nan_to_num(statistics) ** 2, max(statistics.size // ONSETS, 1))
-    largest = np.sort([float(block.max()) for block in blocks if block.size])
-    upper = len(largest) // 2
-    if upper < 5:  # too few for an estimate of their tail
-        return normal
-    threshold, excess = largest[-upper - 1], largest[-upper:] - largest[-upper - 1]
-    scale = float(excess.mean()) * (1.0 + 1.0 / sqrt(upper))
-    return max(normal, sqrt(threshold + scale * max(0.0, log(arl0 * upper / statistics.size))))
+    return max(normal, return_level(statistics, arl0))

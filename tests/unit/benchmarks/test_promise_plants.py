@@ -106,13 +106,15 @@ def test_the_tables_of_black_boxes_and_of_faults_have_a_line_for_each_kind(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def result(job: black_box.Job) -> black_box.Result:
-        return black_box.Result(2 * (job.inputs == "wide"), 0.5, 100, 90, job.seed > black_box.SEED)
+        is_kept = job.seed > black_box.SEED
+        return black_box.Result(2 * (job.inputs == "wide"), 0.5, 100, 90, 0.5 if is_kept else 3.0, is_kept)
 
     monkeypatch.setattr(black_box, "watch", result)
     black_box.print_table(Pool(1), black_box.jobs_of(2, "auto", ["low"], list(FLOWS)))
     lines = capsys.readouterr().out.splitlines()
-    assert lines[2] == "| low | wide | 4 | 1.00 | 4.00 (1.09 to 10.24) | 1 of 2 | 90.0 % |"
-    assert [line.split(" | ")[1] for line in lines[2:]] == [*FLOWS, "all", "all that are said to be kept"]
+    assert lines[2] == "| low | wide | 4 | 1.00 | 4.00 (1.09 to 10.24) | 1 of 2 | 3.5 | 90.0 % |"
+    groups = ["all", "all that are said to be kept", "all that are said not to be kept"]
+    assert [line.split(" | ")[1] for line in lines[2:]] == [*FLOWS, *groups]
     monkeypatch.setattr(black_box, "find_delay", lambda job: 1.0 if job.has_equations else np.inf)
     black_box.print_faults(Pool(1), 1)
     lines = capsys.readouterr().out.splitlines()

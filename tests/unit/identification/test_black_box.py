@@ -15,7 +15,13 @@ from reactorwatch.identification.black_box_filter import (
     constants_of,
     filter_row,
 )
-from reactorwatch.identification.black_box_fit import MOST_PARAMETERS, fit_black_box, largest_shapes, row_kinds
+from reactorwatch.identification.black_box_fit import (
+    MOST_PARAMETERS,
+    fit_black_box,
+    held_out_residuals,
+    largest_shapes,
+    row_kinds,
+)
 from reactorwatch.identification.black_box_model import (
     NEXT,
     START,
@@ -275,13 +281,26 @@ def test_a_coefficient_whose_variance_rounding_made_negative_is_not_determined()
     assert damaged.dynamics_sd == inf
 
 
+def held_out_size(model: BlackBoxModel, inputs: Array, outputs: Array, smallest_sd: Array) -> Array:
+    rows = inputs, outputs, following(len(inputs))
+    return np.asarray(np.nanstd(held_out_residuals(model, rows, outputs, smallest_sd)[0], axis=0))
+
+
 def test_held_out_blocks_separate_a_wrong_model_from_a_right_one() -> None:
     """A quadratic plant is described but for its noise; a plant with jumps of its slope is not, and has no noise."""
-    model, inputs, _ = trained()
-    assert model.error_ratio <= 2.0
-    x, rows = 0.0, []
+    right = held_out_size(*trained(), NOISE_SD / 100)
+    assert np.all((right > 0.9) & (right < 1.1))
+    inputs, x, rows = trained()[1], 0.0, []
     for (u,) in inputs:
         rows.append([x])
         x = 0.6 * x + 0.4 * abs(u + x)
-    wrong = fit_black_box(inputs, np.array(rows), following(TRAINING), np.array([1e-9]))
-    assert wrong.error_ratio > 2.0
+    outputs, smallest_sd = np.array(rows), np.array([1e-9])
+    wrong = fit_black_box(inputs, outputs, following(TRAINING), smallest_sd)
+    assert held_out_size(wrong, inputs, outputs, smallest_sd) > 1.1
+
+
+def test_larger_variances_leave_predictions_as_they_are() -> None:
+    model, inputs, outputs = trained()
+    runs = [BlackBoxFilter(item).run(inputs, outputs, following(TRAINING)) for item in (model, model.scale_sds(3.0))]
+    np.testing.assert_allclose(runs[1][0], runs[0][0], atol=1e-9)
+    np.testing.assert_allclose(runs[1][1], 3.0 * runs[0][1], rtol=1e-9)

@@ -41,6 +41,14 @@ def test_slow_responses_and_feedback_do_not_pretend_a_dead_time() -> None:
     assert find_dead_times(Dataset.of(np.arange(2000), *closed_loop(1.1))) == (1,)
 
 
+@pytest.mark.parametrize(("centre", "noise"), [(0.0, 0.0), (1e6, 1e-6), (0.0, 0.1)])
+def test_a_pure_delay_is_found_at_any_offset_and_without_noise(centre: float, noise: float) -> None:
+    rng = np.random.default_rng(9)
+    u = np.repeat(rng.standard_normal(90), 10)
+    y = np.roll(u, 7) + noise * rng.standard_normal(900)
+    assert find_dead_times(Dataset.of(np.arange(900), u + centre, y + centre)) == (7,)
+
+
 def test_an_input_without_effect_keeps_all_its_lags() -> None:
     data, delays = random_plant(1_541_007, 1)
     both = np.column_stack([data.inputs, np.random.default_rng(8).permutation(data.inputs)])

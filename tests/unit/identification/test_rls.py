@@ -172,6 +172,15 @@ def test_standard_deviations_are_the_scatter_of_many_plants(forgetting: float) -
     assert np.std(residuals) == pytest.approx(np.sqrt(np.mean(deviations**2)), rel=0.05)
 
 
+@pytest.mark.parametrize("forgetting", [1.0, 0.99])
+def test_the_leverage_of_a_row_is_the_variance_of_its_prediction(forgetting: float) -> None:
+    rng = np.random.default_rng(5)
+    rls = learn(rng.standard_normal((200, 6)), rng.standard_normal(200), forgetting=forgetting)
+    row, before = rng.standard_normal(6), rls.memory.to_bytes()
+    assert rls.leverage(row) == pytest.approx(row @ rls.covariance @ row, rel=1e-9)
+    assert rls.memory.to_bytes() == before
+
+
 def test_the_prediction_is_made_before_the_row_is_used() -> None:
     rng = np.random.default_rng(12)
     rls = learn(rng.standard_normal((20, 3)), rng.standard_normal(20))

@@ -180,7 +180,7 @@ def test_an_uninformative_input_hinders_no_monitor(kind: str) -> None:
     assert monitor.failures.by_stage == {}
     assert not set(plant.outputs) & set(monitor.excluded_signals)
     raised = [item.message.alarm for item in published if isinstance(item.message, Alarm)]
-    assert "shewhart/y2" in raised
+    assert {"shewhart/y2", "shift/y2"} & set(raised)
     assert ("u1" in monitor.excluded_signals) == (kind in ("never there", "rare", "gone"))
 
 

@@ -135,7 +135,8 @@ def test_models_are_published_in_the_units_of_the_samples(leak: list[Encoded]) -
     p = {item.name: item.value for item in reference.parameters}
     row = 1001
     T, qc = columns["T"], columns["qc"]
-    by_hand = p["c"] + sum(p[f"a{lag}"] * T[row - lag] + p[f"b{lag}"] * qc[row - lag] for lag in (1, 2, 3))
+    lags = range(1, reference.order + 1)
+    by_hand = p["c"] + sum(p[f"a{lag}"] * T[row - lag] + p[f"b{lag}"] * qc[row - lag] for lag in lags)
     estimate = next(
         item.message for item in published
         if item.key.endswith("estimate/T") and item.message.time_ns == to_time_ns(float(time_min[row]))

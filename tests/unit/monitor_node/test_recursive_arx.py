@@ -13,7 +13,7 @@ from tests.exchanger import config_of, random_exchanger, simulate
 
 from .samples import feed_row
 
-ROWS, SECOND_NS, ORDER = 1600, 10**9, 3
+ROWS, SECOND_NS = 1600, 10**9
 
 
 @pytest.fixture(scope="module")
@@ -41,14 +41,15 @@ def test_its_prediction_is_that_of_its_newest_parameters(
     flow, measured = plant
     monitor, compared = Monitor(config_of(reference), 0), 0
     for k, values in enumerate(zip(flow.tolist(), measured.tolist(), strict=True)):
-        known = {}
+        known, order = {}, 0
         if k > 1050 and k % 50 == 0:
-            known = {item.name: item.value for item in adaptive(monitor).parameters}
+            model = adaptive(monitor)
+            known, order = {item.name: item.value for item in model.parameters}, model.order
         found = {item.key: item.message for item in take(monitor, k, values)}
         estimate = found.get(f"reactor/exchanger/estimate/{end}")
         if known and estimate is not None:
             assert isinstance(estimate, Estimate)
-            lags = range(1, ORDER + 1)
+            lags = range(1, order + 1)
             expected = known["c"] + sum(known[f"a{i}"] * measured[k - i] + known[f"b{i}"] * flow[k - i] for i in lags)
             assert estimate.prediction == pytest.approx(expected, abs=1e-6)
             assert estimate.residual == pytest.approx(measured[k] - expected, abs=1e-6)

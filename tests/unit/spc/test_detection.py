@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from reactorwatch.spc.detection import POWER, Detector, smallest_sizes
+from reactorwatch.spc.detection import POWER, Detector, error_factor, smallest_sizes
 
 ROWS = 100
 
@@ -75,3 +75,25 @@ def test_what_does_nothing_is_never_seen() -> None:
     chart = Detector((0,), np.eye(1), 0.1, 5.0)
     assert np.isinf(smallest_sizes(np.zeros((1, 1, ROWS, 1)), [chart], [ROWS], 0.0)).all()
     assert np.isinf(smallest_sizes(np.ones((1, 1, ROWS, 1)), [], [ROWS], 0.0)).all()
+
+
+@pytest.mark.parametrize("correlation", [0.0, 0.9])
+def test_limits_of_errors_with_exponential_tails_are_crossed_no_more_often_than_promised(correlation: float) -> None:
+    """100 trainings of 1,000 rows and 10,000 rows after each, in which each chart may be crossed once.
+
+    Normal limits are crossed ten times as often, or more.
+    """
+    rng, arl0, rows = np.random.default_rng(3), 1e4, 1000
+    charts = [Detector((0,), np.eye(1), 1.0, 3.89), Detector((0,), np.eye(1), 0.1, 3.2)]
+    normal, wide = np.zeros(2), np.zeros(2)
+    for _ in range(100):
+        errors = lfilter([1.0], [1.0, -correlation], rng.laplace(size=11_000))
+        e = errors / errors[:rows].std()
+        factor = error_factor(e[:rows, None], charts, arl0)
+        for i, chart in enumerate(charts):
+            average = lfilter([chart.weight], [1.0, chart.weight - 1.0], e) / sqrt(chart.weight / (2.0 - chart.weight))
+            largest = np.abs(average[rows:]).reshape(-1, 100).max(axis=1) / chart.level  # a cluster is one event
+            normal[i] += np.count_nonzero(largest > 1.0)
+            wide[i] += np.count_nonzero(largest > factor)
+    assert np.all(wide < 1.2 * 100)
+    assert normal[0 if correlation == 0.0 else 1] > 10 * wide.max()

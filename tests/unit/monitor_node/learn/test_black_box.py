@@ -6,6 +6,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from benchmarks.harness.plants import sound_record
 from monitor_node.config import MonitorConfig
 from monitor_node.core import Monitor
 from monitor_node.learn.black_box_reference import BlackBoxReference
@@ -87,6 +88,52 @@ def test_auto_takes_the_black_box_where_there_are_no_equations(leak: list[Encode
     raised_min = [alarm.raised_ns / 6e10 for alarm, _ in result.raised_alarms]
     assert raised_min
     assert ONSET_MIN < min(raised_min) < ONSET_MIN + 2.0
+
+
+def noise_free(bias: float) -> list[Encoded]:
+    """A reactor without noise, whose temperature is measured with a bias from `ONSET_MIN` on."""
+    record = sound_record("mid", "none", 3, 200.0)
+    columns = {name: np.array(values) for name, values in record.columns.items()}
+    columns["T"][np.array(record.time_min) >= ONSET_MIN] += bias
+    return of_plant("x", samples(np.array(record.time_min), columns))
+
+
+NOISE_FREE = msgspec.structs.replace(BLACK_BOX, charts=("shewhart", "ewma", "mewma"), process="", smallest_sd={})
+
+
+def test_errors_of_a_model_without_noise_raise_no_alarm_and_a_twentieth_of_the_usual_noise_is_seen_at_once() -> None:
+    """A bias of 0.015 K; the usual noise of the thermometer is 0.3 K."""
+    sound, biased = (Monitor(NOISE_FREE, 0, points=False) for _ in range(2))
+    assert not raised_by(sound, noise_free(0.0))
+    raised = raised_by(biased, noise_free(0.015))
+    assert raised[0].time_ns < to_time_ns(ONSET_MIN + 1.0)
+    (step,) = (alarm.text for alarm in raised if alarm.alarm == "shift/T")
+    size = float(step.split("moved by +")[1].split()[0])
+    assert 0.01 < size < 0.03  # a filter that ran away would say a hundred times as much
+    reference = reference_of(sound)
+    assert reference.errs
+    assert any("the residuals are errors of the black box" in note for note in sound.notes)
+    assert sound.promise is not None
+    assert sound.promise.kept
+    np.testing.assert_array_equal(reference.parameters[0], reference.model.theta.ravel())  # nothing is learned
+
+
+def raised_by(monitor: Monitor, messages: list[Encoded]) -> list[Alarm]:
+    published = [item.message for message in messages for item in monitor.on_message(message, 0)]
+    return [item for item in published if isinstance(item, Alarm) and item.event == "raised"]
+
+
+def test_a_model_that_errs_is_compiled_and_resumes_bit_for_bit() -> None:
+    messages = noise_free(0.0)[:4500]
+    stepped, staged, steps = Monitor(NOISE_FREE, 0, points=False), stage_by_stage(NOISE_FREE, points=False), 0
+    for k, message in enumerate(messages):
+        if k == 3000:
+            stored, stepped = stepped.to_bytes(), Monitor(NOISE_FREE, 0, points=False)
+            stepped.from_bytes(stored)
+        steps += stepped.pipeline.evaluation.is_ordinary
+        assert stepped.on_message(message, 0) == staged.on_message(message, 0)
+    assert steps > 1000
+    assert stepped.to_bytes() == staged.to_bytes()
 
 
 def test_too_many_signals_are_judged_by_the_identified_models_and_the_reason_is_noted() -> None:
