@@ -54,6 +54,12 @@ times as much does not make an interval disturbed."""
 NO_VALUE = "no value of it has come"
 """Reason for leaving a signal without values out."""
 
+ERRS = (
+    "the residuals are errors of the black box, not noise: limits follow from the largest of them, and nothing is "
+    "learned after the training"
+)
+"""Remark on a reference that errs."""
+
 NOTHING_LEARNED = Prewhitening(0.0, (), 1.0, FEWEST_ROWS, 0.5 / FEWEST_ROWS, 0.0)
 """Prewhitening of an output that is left out and not evaluated."""
 
@@ -167,6 +173,8 @@ def learn_baseline(
             after_moves = compare_after_moves(np.column_stack(columns), inputs)
     found = {"training": [refused or _screening_summary(outputs, time_min, screenings, evaluated) or "ok"]}
     found[BlackBoxReference.kind] = [weakness] if weakness else []
+    if reference.errs:
+        found[BlackBoxReference.kind].append(ERRS)
     if choice.without_black_box and config.reference == "black-box":
         found[BlackBoxReference.kind].append(f"the ARX models judge: {choice.without_black_box}")
     if reference.is_identified:

@@ -20,7 +20,7 @@ from monitor_node.learn.training_rows import RowArrays
 from reactorwatch.arrays import Array
 from reactorwatch.contract.messages_pb2 import ModelSnapshot, Parameter
 from reactorwatch.errors import InputError
-from reactorwatch.identification.black_box_filter import MEMORY, BlackBoxFilter, BlackBoxFilterMemory
+from reactorwatch.identification.black_box_filter import MEMORY, RATE, BlackBoxFilter, BlackBoxFilterMemory
 from reactorwatch.identification.black_box_fit import fit_black_box, held_out_residuals
 from reactorwatch.identification.black_box_model import BlackBoxModel
 from reactorwatch.kalman.batch import GATE
@@ -37,9 +37,8 @@ LARGEST_BY_NOISE = 1.1
 """Size of held-out residuals in standard deviations up to which noise explains them: 1.00 to 1.05 with noise, 1.2 to 2
 without (records of `make promise`, other seeds)."""
 
-LARGEST_ERROR = GATE / 4.0
-"""Standard deviations that the largest held-out error of a model has: so one four times as large is an outlier, and
-corrects nothing. In 14,000 rows after a training of 1,000 the largest was up to 2.9 times as large (`make promise`)."""
+LARGEST_ERROR = 3.24
+"""Standard deviations that the largest held-out error of a model has, as the largest of 1,000 normal values."""
 
 
 class BlackBoxMemory(Memory, tag="black-box"):
@@ -97,6 +96,8 @@ class BlackBoxReference(FilterReference):
         self._memory, self.model = memory, memory.model
         self._filter = BlackBoxFilter(memory.model, memory.filter)
         memory.filter = self._filter.memory
+        if memory.error_scale:
+            self._filter.constants[RATE] = 0.0
         self._outputs, self._count, self.period_min = memory.outputs, memory.count, memory.period_min
         if memory.unfamiliar_rows:
             self.obstacles = UNFAMILIAR

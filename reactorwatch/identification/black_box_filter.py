@@ -38,6 +38,7 @@ BINS = 64  # intervals of the values of an input, each a quarter of its standard
 MEMORY = 10_000  # rows after which a row is forgotten
 FLAGS = 3  # numbers at the start of a belief: learning flag, flag of unfamiliar inputs, rows since they settled
 HEAD = 7  # numbers at the start of the constants: outputs, inputs, lags, delay, terms, degree, rate of forgetting
+RATE = 6  # index of the latter; 0: a model that errs, which is never learned, and is corrected by values however far
 FAILED, UNJUDGED, JUDGED = -1.0, 0.0, 1.0  # above zero if the row is judged, as in `ekf_step`
 
 
@@ -131,7 +132,7 @@ def filter_row(
         if share < p * terms:
             for a in range(n_x, size):
                 for b in range(n_x, size):
-                    P[a, b] += constants[6] * P[a, b]
+                    P[a, b] += constants[RATE] * P[a, b]
     measured, limits, is_within = given[2 * m + 3 : 2 * m + 3 + p], given[2 * m + 3 + p :], True
     for j in range(p):
         variance = P[j, j] + r[j]
@@ -162,7 +163,8 @@ def filter_row(
     column, end = np.empty(size), size if learns else n_x
     for j in range(p):
         value = (measured[j] - centres[j]) / spreads[j]
-        if not abs(results[3 * p + j]) <= limits[j]:  # also a missing value
+        far = not abs(results[3 * p + j]) <= limits[j]  # also a missing value
+        if far and (constants[RATE] > 0.0 or not abs(results[3 * p + j]) < inf):
             continue
         column[:] = P[j]
         S, error = column[j] + r[j], value - x[j]

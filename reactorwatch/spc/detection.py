@@ -53,7 +53,9 @@ class Detector(NamedTuple):
 
 
 def error_factor(e: Array, detectors: Sequence[Detector], arl0: float) -> float:
-    """Times by which limits have to be wider where residuals are errors of a model, by their peaks; at least 1.
+    """Times by which limits have to be wider where residuals are errors of a model, by their peaks.
+
+    At least 1, and so much that none of the rows given would have raised an alarm.
 
     Args:
         e: prewhitened residuals of held-out rows, shape (rows, signals); NaN where there is none.
@@ -70,7 +72,7 @@ def error_factor(e: Array, detectors: Sequence[Detector], arl0: float) -> float:
         violated = np.sort(recent, axis=1)[:, -count]
         np.maximum(largest, violated / (chart.level * sqrt(chart.weight / (2.0 - chart.weight))), out=largest)
     # the tails of errors are those of exponential values rather than normal ones: so not their squares
-    return max(return_level(np.sqrt(largest), arl0) ** 2, 1.0)
+    return max(return_level(np.sqrt(largest), arl0) ** 2, float(largest.max(initial=1.0)))
 
 
 class _Path(NamedTuple):

@@ -104,18 +104,23 @@ NOISE_FREE = msgspec.structs.replace(BLACK_BOX, charts=("shewhart", "ewma", "mew
 def test_errors_of_a_model_without_noise_raise_no_alarm_and_a_twentieth_of_the_usual_noise_is_seen_at_once() -> None:
     """A bias of 0.015 K; the usual noise of the thermometer is 0.3 K."""
     sound, biased = (Monitor(NOISE_FREE, 0, points=False) for _ in range(2))
-    assert not [item for message in noise_free(0.0) for item in sound.on_message(message, 0) if is_raised(item)]
-    raised = [item for message in noise_free(0.015) for item in biased.on_message(message, 0) if is_raised(item)]
-    assert raised[0].message.time_ns < to_time_ns(ONSET_MIN + 1.0)
+    assert not raised_by(sound, noise_free(0.0))
+    raised = raised_by(biased, noise_free(0.015))
+    assert raised[0].time_ns < to_time_ns(ONSET_MIN + 1.0)
+    (step,) = (alarm.text for alarm in raised if alarm.alarm == "shift/T")
+    size = float(step.split("moved by +")[1].split()[0])
+    assert 0.01 < size < 0.03  # a filter that ran away would say a hundred times as much
     reference = reference_of(sound)
     assert reference.errs
+    assert any("the residuals are errors of the black box" in note for note in sound.notes)
     assert sound.promise is not None
     assert sound.promise.kept
     np.testing.assert_array_equal(reference.parameters[0], reference.model.theta.ravel())  # nothing is learned
 
 
-def is_raised(item: Publication) -> bool:
-    return isinstance(item.message, Alarm) and item.message.event == "raised"
+def raised_by(monitor: Monitor, messages: list[Encoded]) -> list[Alarm]:
+    published = [item.message for message in messages for item in monitor.on_message(message, 0)]
+    return [item for item in published if isinstance(item, Alarm) and item.event == "raised"]
 
 
 def test_a_model_that_errs_is_compiled_and_resumes_bit_for_bit() -> None:
