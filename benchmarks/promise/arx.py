@@ -38,6 +38,9 @@ SETTLING, SAME_EVENT, FAULTS = 400, 30, 10
 SEED = 200
 """First seed; the records of those before were looked at when the model was designed."""
 
+CHARTS = ("shewhart", "ewma", "mewma")
+"""Charts of residuals: the usual ones without `level`, which compares the plant with its training and not the model."""
+
 FACTORS = np.geomspace(1.0, 5.0, 33)
 """Limits of the peer, in units of those for the stated rate."""
 
@@ -161,6 +164,7 @@ def watch(job: Job) -> Result:
         reference="arx",
         training_rows=TRAINING,
         false_alarms_per_30_days=RATE,
+        charts=CHARTS,
     )
     spans = sorted((item.raised_min, item.cleared_min or inf) for item in found.alarms)
     events, end = [], -inf

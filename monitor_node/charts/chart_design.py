@@ -165,6 +165,10 @@ class ChartDesign:
                     found.append(Detector(tuple(group), matrix, weight, level, rule))
         return found
 
+    def level_reaches(self, values: Array, arl0: float) -> dict[str, float]:
+        """See `Level.reaches`; empty without this chart. Arguments as for `relative_rates`."""
+        return Level.reaches(self.value_baseline(values, arl0)) if Level.name in self.chosen else {}
+
     def _groups(self, kind: type[Chart]) -> list[list[int]]:
         """Indices of the outputs of each chart of a kind."""
         evaluated: list[int] = np.flatnonzero(self.evaluated).tolist()

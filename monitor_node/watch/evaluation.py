@@ -231,6 +231,7 @@ class Evaluation:
                 trained.reference,
                 trained.learned,
                 self.charts.design.detectors(trained.learned, trained.e, self.memory.arl0),
+                self.charts.design.level_reaches(trained.values, self.memory.arl0),
                 self.shift.sensitivities,
                 self.evaluated,
                 dict(zip(self._config.outputs, units, strict=True)),

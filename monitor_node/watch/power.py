@@ -65,7 +65,8 @@ class Watch(NamedTuple):
         config: settings of the monitor.
         reference: the reference.
         learned: prewhitening of each output.
-        detectors: the charts.
+        detectors: the charts of residuals.
+        level_reaches: by output, the bias that the chart of levels sees in the long run, in its unit.
         steps: statistic of each output's test of lasting steps after a step of one unit, and its limit; empty without
             tests.
         evaluated: for each output, True if it is evaluated.
@@ -77,6 +78,7 @@ class Watch(NamedTuple):
     reference: Reference
     learned: Sequence[Prewhitening]
     detectors: Sequence[Detector]
+    level_reaches: dict[str, float]
     steps: Sequence[tuple[float, float]]
     evaluated: Sequence[bool]
     units: dict[str, str]
@@ -94,10 +96,25 @@ def state_power(watch: Watch, rows: TrainingRows) -> list[Power]:
     steps = smallest_sizes(stepped, [*watch.detectors, *tests], horizons, 0.0)
     ramps = smallest_sizes(paths, watch.detectors, horizons, horizons[-1])
     return [
-        _message(item, profile, sizes, watch.period_min)
+        _message(item, profile, np.minimum(sizes, _level_sizes(watch, item, profile)).tolist(), watch.period_min)
         for profile, found in (("", steps), (RAMP, ramps))
-        for item, sizes in zip(deviations, found.tolist(), strict=True)
+        for item, sizes in zip(deviations, found, strict=True)
     ]
+
+
+def _level_sizes(watch: Watch, deviation: Deviation, profile: str) -> Array:
+    """Sizes of a bias that the chart of levels sees in the last row of each horizon; infinite for other deviations.
+
+    It looks at a slow signal, of which rows before the last say little more.
+    """
+    output, _, kind = deviation.name.rpartition(".")
+    rows = np.floor(np.array(HORIZONS_MIN) / watch.period_min)
+    weight = watch.config.chart_settings["level_weight"]
+    gains = 1.0 - (1.0 - weight) ** rows
+    if profile:
+        gains = (rows - gains * (1.0 - weight) / weight) / max(rows[-1], 1.0)
+    reach = watch.level_reaches.get(output, np.inf) if kind == "bias" else np.inf
+    return reach / np.maximum(gains, 1e-300)
 
 
 def _add_step_tests(watch: Watch, names: Sequence[str], paths: Array) -> tuple[Array, list[Detector]]:

@@ -22,6 +22,7 @@ from reactorwatch.codegen.numba_kernel import Entry, inline, jit
 from reactorwatch.errors import InputError, positive
 from reactorwatch.spc.charts.base import LARGEST_VALUE, Judgement, Setting, vector
 from reactorwatch.spc.charts.value_chart import ValueBaseline, ValueChart
+from reactorwatch.spc.detection import POWER
 from reactorwatch.spc.false_alarm_budget import TrainingErrors
 from reactorwatch.spc.slow_levels import FEWEST_SAMPLES, LAGS, InputResponse, SlowLevels, sample_spacing
 from reactorwatch.stored_state import Memory
@@ -212,6 +213,13 @@ class Level(ValueChart):
                 for i in range(slow.sds.size)
             )
         )
+
+    @classmethod
+    def reaches(cls, baseline: ValueBaseline) -> dict[str, float]:
+        """For each output, how far a level has to be moved to be out in nine of ten cases, in its unit."""
+        slow = _slow_levels(baseline)
+        reaches = slow.limits(baseline.arl0) + float(special.ndtri(POWER)) * slow.sds
+        return dict(zip(baseline.names[baseline.inputs :], reaches.tolist(), strict=True))
 
     def update(self, x: ArrayLike) -> Judgement:
         """See `Chart`; x has shape (k + p,)."""

@@ -100,6 +100,19 @@ def test_a_limit_is_not_below_that_of_a_normal_process_with_the_largest_level_of
         assert found == pytest.approx(exact[0] / exact[1], rel=0.02)
 
 
+@pytest.mark.parametrize("phi", [PHI, 0.5])
+def test_a_bias_of_the_stated_reach_is_out_in_nine_of_ten_cases(phi: float) -> None:
+    """In the last row; before, a signal that forgets sooner than the average has further chances."""
+    rng, seen = np.random.default_rng(14), list[bool]()
+    for _ in range(100):
+        baseline = baseline_of(wandering(rng, 1000, 1, phi))
+        chart, reach = Level.design(baseline), Level.reaches(baseline)["s0"]
+        for _ in range(10):
+            seen.append(bool(statistics(chart, reach + wandering(rng, 100, 1, phi))[-1] > 1.0))
+            chart.restart()
+    assert 0.87 < np.mean(seen) < 0.97
+
+
 def test_while_an_output_is_missing_its_level_follows_the_inputs() -> None:
     rng = np.random.default_rng(12)
     rows = driven(rng, np.repeat(rng.uniform(-1.0, 1.0, 75), 40), 20.0)
