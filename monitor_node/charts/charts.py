@@ -237,8 +237,9 @@ class ChartWatch:
 
     @property
     def reads_values(self) -> bool:
-        """True if a chart judges the values of rows that are not predicted."""
-        return any(charts.judges_unpredicted for charts in self._watched.values())
+        """True if a chart judges the values of rows that are not predicted, other than slow changes beside others."""
+        seen = {name: charts.judges_unpredicted for name, charts in self._watched.items()}
+        return any(judges for name, judges in seen.items() if name != Level.name or len(seen) == 1)
 
     def load(self, p: np.void) -> None:
         """Fill the numbers of a plant, see `row_frame.FrameTypes`, from the charts and their alarms."""
