@@ -45,7 +45,7 @@ from reactorwatch.kalman.filter_states import (
 )
 from reactorwatch.kalman.noise_estimation import NoiseFit, losses_nearby, resolution_sd
 from reactorwatch.process import DEFAULT_PROCESS, effects_of, own_effects
-from reactorwatch.process.effect import Effect
+from reactorwatch.process.effect import Effect, ParameterEffect, ParameterShift
 from reactorwatch.process.extended_model import parse_extended_model, stored_model
 from reactorwatch.process.model import MODEL_CACHE_SIZE, ProcessModel
 from reactorwatch.process.profiles import FREE_NAME
@@ -250,6 +250,9 @@ LEAST_GAIN = 8.0
 MOST_DISTURBANCES = 4
 """Number of disturbances from which on no further one is sought: a filter of so many more states would be slow."""
 
+MOST_CONSTANTS = 10
+"""Number of constants of the model up to which all may be uncertain: a filter of more states would be slow."""
+
 MOST_FITTED = 2
 """Number of single disturbances that are fitted to find the next: the likeliest with the other noise as it is."""
 
@@ -267,8 +270,13 @@ def find_uncertain(model: ProcessModel, outputs: tuple[str, ...], rows: RowArray
         plain = fitter.fit(())
     x = np.nanmedian(fitter.filter(plain).x, axis=0)
     constants = tuple(f"{CONSTANT} {name}" for name in select_effects(model, x, np.nanmedian(rows.inputs, axis=0)))
-    wide = fitter.fit(constants)
-    best = wide if wide.noise.loss < plain.noise.loss - LEAST_GAIN else plain
+    own = tuple(
+        f"{CONSTANT} {item.name}" for item in effects_of(model) if isinstance(item, ParameterEffect | ParameterShift)
+    )
+    wide, best = fitter.fit(constants), plain
+    for found in (wide, fitter.fit(own)) if 0 < len(own) <= MOST_CONSTANTS else (wide,):
+        if found.noise.loss < min(best.noise.loss, plain.noise.loss - LEAST_GAIN):
+            best = found
     most = len(best.uncertain) + MOST_DISTURBANCES
     inputs = tuple(f"{WANDER} {name}" for name in model.input_names)
     balances = [item.name for item in model.states if item.name not in model.at_rest]
@@ -284,7 +292,7 @@ def find_uncertain(model: ProcessModel, outputs: tuple[str, ...], rows: RowArray
             break
         best = found
     if not {*constants} <= {*best.uncertain}:
-        wide = fitter.fit((*constants, *best.uncertain)) if best.uncertain else wide
+        wide = fitter.fit(tuple(dict.fromkeys((*constants, *best.uncertain)))) if best.uncertain else wide
         certain, uncertain = fitter.sds_after_moves(best), fitter.sds_after_moves(wide)
         if np.any(uncertain > 1.25 * certain):  # the training leaves open how the plant follows
             best = wide

@@ -90,11 +90,11 @@ def test_a_step_in_rows_that_are_not_judged_is_seen(reference: ReferenceName) ->
     """The flow moves little in the training, so many later rows are extrapolations; nine of ten steps are seen."""
     rng = np.random.default_rng(5)
     plant = random_exchanger(rng)
-    flow, measured = simulate(plant, 1400, rng, calm=1000)
+    flow, measured = simulate(plant, 1800, rng, calm=1000)
     monitor, unjudged = Monitor(config_of(reference), 0), []
     for k, values in enumerate(zip(flow.tolist(), measured.tolist(), strict=True)):
         publications = take(monitor, k, values)
-        if 1050 < k < 1380 and not any(item.key.endswith("/estimate/th") for item in publications):
+        if 1050 < k < 1780 and not any(item.key.endswith("/estimate/th") for item in publications):
             unjudged.append(k)
     assert len(unjudged) >= 10
     onsets = unjudged[:: len(unjudged) // 10][:10]
