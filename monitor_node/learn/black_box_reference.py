@@ -24,6 +24,7 @@ from reactorwatch.identification.black_box_filter import MEMORY, RATE, BlackBoxF
 from reactorwatch.identification.black_box_fit import fit_black_box, held_out_residuals
 from reactorwatch.identification.black_box_model import BlackBoxModel
 from reactorwatch.kalman.batch import GATE
+from reactorwatch.kalman.noise_estimation import initial_sensor_sd
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.records.record import MINUTE_NS
 from reactorwatch.stored_state import Memory, copy_of
@@ -36,6 +37,11 @@ UNFAMILIAR = {
 LARGEST_BY_NOISE = 1.1
 """Size of held-out residuals in standard deviations up to which noise explains them: 1.00 to 1.05 with noise, 1.2 to 2
 without (records of `make promise`, other seeds)."""
+
+NOISE_RATIOS = (0.5, 2.0)
+"""Smallest and largest residual over the noise that third differences of the output show with which noise explains them
+in any case: 0.8 to 1.6 for reactors and heat exchangers with noise, 0.01 to 0.1 and above 1,000 for reactors without.
+With disturbances that wander, held-out residuals of noise have sizes up to 1.3."""
 
 LARGEST_ERROR = 3.24
 """Standard deviations that the largest held-out error of a model has, as the largest of 1,000 normal values."""
@@ -142,7 +148,11 @@ class BlackBoxReference(FilterReference):
         held_out, held_out_sds = held_out_residuals(model, (inputs, measured[:, outputs], follows), known, smallest)
         fitted = np.isfinite(measured[:, outputs]) & np.isfinite(held_out)
         squares = np.sum(np.square(held_out), axis=0, where=fitted) / np.maximum(np.sum(fitted, axis=0), 1)
-        if squares.max() > LARGEST_BY_NOISE**2:
+        sizes = [column[np.isfinite(column)] for column in np.abs(held_out * held_out_sds).T]
+        typical = np.array([np.median(item) if item.size else 0.0 for item in sizes]) / 0.6745  # of a normal value
+        noise = np.array([initial_sensor_sd(column) for column in known.T])
+        is_noise = (NOISE_RATIOS[0] * noise <= typical) & (typical <= NOISE_RATIOS[1] * noise)
+        if np.any((squares > LARGEST_BY_NOISE**2) & ~is_noise):
             scale = float(np.nanmax(np.abs(held_out))) / LARGEST_ERROR
             residuals, sds = held_out * held_out_sds, held_out_sds * scale
             reference = cls(
