@@ -181,6 +181,7 @@ class Evaluation:
         """Start to evaluate rows, or `again` by another model: the drift of the identified models then goes on."""
         self._leave_out(trained.left_out)
         self.charts.design.is_identified = trained.reference.is_identified
+        self.charts.design.has_equations = trained.reference.follows_equations
         unmade = self.charts.design.choose(self.evaluated, trained.e, trained.values)
         self.shift.is_active = trained.responses is not None and not self._config.has_values_only
         trained.checks.extend(

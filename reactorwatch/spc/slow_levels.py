@@ -26,10 +26,12 @@ T being Owen's (1956, Tables for computing bivariate normal probabilities, Ann. 
 of its steps, which the training shows, over s^2; for small d it is the formula of Rice (1944, Mathematical analysis of
 random noise, Bell System Techn. J. 23). The limit x is where the mean of this rate over r is 1 / ARL0. Levels that are
 not normal, such as the error of the regression where a plant is not linear, come farther: x is not below that of a
-normal process whose largest level in the rows of the training is the one that came.
+normal process whose largest level in the rows of the training is the one that came, with inputs also in blocks of rows
+whose response is that of the others (`largest_held_out`).
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from itertools import pairwise
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -49,6 +51,10 @@ their mixture to some percent; of slower ones a training of 1,000 rows does not 
 
 SETS = ((0,), (1,), (2,), (3,), (0, 1), (1, 2), (2, 3))
 """Sets of averages of the inputs, of which one explains an output: a lag, or one between two neighbours."""
+
+
+BLOCKS = 5
+"""Blocks of the training, as in the other cross-validations of a training (`spc.charts.value_chart`)."""
 
 
 class InputResponse(NamedTuple):
@@ -81,7 +87,7 @@ class SlowLevels(NamedTuple):
         variances: variance of the level by memory, shape (memories, p).
         errors: variance of the regression by memory, at the mean, shape (memories, p).
         freedom: degrees of freedom of the innovations' variance.
-        largest: largest size of each level in the training, shape (p,).
+        largest: largest size of each level in the training, also in blocks that were held out, shape (p,).
         rows: number of rows of the training.
     """
 
@@ -149,7 +155,10 @@ class SlowLevels(NamedTuple):
             variances,
             errors,
             min(item.freedom for item in chosen),
-            np.max(np.abs(levels[spacing:]), axis=0),
+            np.maximum(
+                np.max(np.abs(levels[spacing:]), axis=0),
+                largest_held_out(driving[spacing:], averages[spacing:], [SETS[item] for item in best]) if k else 0.0,
+            ),
             float(len(values)),
         )
 
@@ -212,6 +221,28 @@ class _Fit(NamedTuple):
         likelihood, variances, coefficients, inverses, unrestricted = map(np.array, zip(*found, strict=True))
         scores = unrestricted.max(axis=0) - 0.5 * np.log(count) * design.shape[1]
         return cls(likelihood, variances, coefficients, inverses, scores, freedom)
+
+
+def largest_held_out(driving: Array, averages: Array, sets: Sequence[tuple[int, ...]]) -> Array:
+    """Largest size of each level in blocks of the rows, as a regression on the other rows has it, shape (p,).
+
+    A response to inputs that the rows determine is the same in all blocks. One set point more, or a plant that is not
+    linear, makes another.
+
+    Args:
+        driving: averages of the inputs, shape (rows, k, lags).
+        averages: averages of the outputs, shape (rows, p).
+        sets: lags that explain each output.
+    """
+    found, bounds = np.zeros(len(sets)), np.linspace(0, len(averages), BLOCKS + 1).astype(int)
+    for first, end in pairwise(bounds.tolist()):
+        others = np.r_[0:first, end : len(averages)]
+        for i, lags in enumerate(sets):
+            design = np.column_stack([np.ones(len(averages)), driving[:, :, list(lags)].reshape(len(averages), -1)])
+            coefficients = np.linalg.lstsq(design[others], averages[others, i])[0]
+            sizes = np.abs(averages[first:end, i] - design[first:end] @ coefficients)
+            found[i] = max(found[i], float(sizes.max()))
+    return found
 
 
 def sample_spacing(weight: float) -> int:
