@@ -33,7 +33,7 @@ from reactorwatch.codegen.compiled_function import LANES
 from reactorwatch.kalman.batch import GATE, FilterRecord, FilterResult, run_together
 from reactorwatch.kalman.ekf import Filter
 from reactorwatch.kalman.ekf_step import NoiseLevels
-from reactorwatch.kalman.filter_states import NOISE, widen_model
+from reactorwatch.kalman.filter_states import NOISE, WANDER, widen_model
 from reactorwatch.process.model import ProcessModel
 
 INITIAL_SHARES = (0.3, 0.03, 0.003)
@@ -108,7 +108,9 @@ def losses_nearby(
 def noise_starts(
     model: ProcessModel, added: tuple[str, ...], measured: Array, smallest_sd: Sequence[float]
 ) -> list[NoiseLevels]:
-    """Noise levels from which a search should start, too: all noise is coloured noise where there is such.
+    """Noise levels from which a search should start, too.
+
+    All noise is coloured noise, and inputs that wander are all that moves the states, where there are such.
 
     Args:
         model: the model without what is added to it.
@@ -116,16 +118,20 @@ def noise_starts(
         measured: measurements, shape (rows, n_y); NaN where missing.
         smallest_sd: lower bounds of the sensors' noise.
     """
-    coloured = [item.split(" ", 1)[1] for item in added if item.startswith(f"{NOISE} ")]
-    if not coloured:
+    names = [item.split(" ", 1) for item in added]
+    coloured = [name for kind, name in names if kind == NOISE]
+    wandering = {f"{name}.wander" for kind, name in names if kind == WANDER and name in model.input_names}
+    if not coloured and not wandering:
         return []
     sds = np.maximum([initial_sensor_sd(column) for column in measured.T], smallest_sd)
     by_name = dict(zip(model.output_names, sds.tolist(), strict=True))
-    names = widen_model(model, added).state_names
-    driving = np.array([by_name.get(name.removesuffix(".memory"), 0.0) * name.endswith(".memory") for name in names])
+    states = widen_model(model, added).states
+    driving = np.array([by_name.get(s.name.removesuffix(".memory"), 0.0) * s.name.endswith(".memory") for s in states])
+    moving = np.array([state.scale * (state.name in wandering) for state in states])
     sensors = tuple(0.3 * sd if name in coloured else sd for name, sd in by_name.items())
     # Third differences see little of coloured noise.
-    return [NoiseLevels(sensors, tuple((share * driving).tolist())) for share in (2.0, 6.0, 20.0)]
+    shares = ((2.0, 0.03), (6.0, 0.3), (20.0, 3.0))
+    return [NoiseLevels(sensors, tuple((noise * driving + wander * moving).tolist())) for noise, wander in shares]
 
 
 class _NoiseSearch:
