@@ -27,7 +27,7 @@ of its steps, which the training shows, over s^2; for small d it is the formula 
 random noise, Bell System Techn. J. 23). The limit x is where the mean of this rate over r is 1 / ARL0. Levels that are
 not normal, such as the error of the regression where a plant is not linear, come farther: x is not below that of a
 normal process whose largest level in the rows of the training is the one that came, with inputs also in blocks of rows
-whose response is that of the others (`largest_held_out`).
+whose response is that of the others (`largest_in_blocks`).
 """
 
 from collections.abc import Callable, Sequence
@@ -157,7 +157,7 @@ class SlowLevels(NamedTuple):
             min(item.freedom for item in chosen),
             np.maximum(
                 np.max(np.abs(levels[spacing:]), axis=0),
-                largest_held_out(driving[spacing:], averages[spacing:], [SETS[item] for item in best]) if k else 0.0,
+                largest_in_blocks(driving[spacing:], averages[spacing:], [SETS[item] for item in best]) if k else 0.0,
             ),
             float(len(values)),
         )
@@ -223,7 +223,7 @@ class _Fit(NamedTuple):
         return cls(likelihood, variances, coefficients, inverses, scores, freedom)
 
 
-def largest_held_out(driving: Array, averages: Array, sets: Sequence[tuple[int, ...]]) -> Array:
+def largest_in_blocks(driving: Array, averages: Array, sets: Sequence[tuple[int, ...]]) -> Array:
     """Largest size of each level in blocks of the rows, as a regression on the other rows has it, shape (p,).
 
     A response to inputs that the rows determine is the same in all blocks. One set point more, or a plant that is not
