@@ -152,7 +152,12 @@ def open_state(data: bytes, settings: dict[str, Any]) -> MonitorState:
     except ValueError as error:
         raise InputError(f"is no state of this software's monitor: {error}") from error
     by = f" by {state.build}" if state.build not in ("", this_build()) else ""
-    stored = {name: value for name, value in state.settings.items() if name in settings or name not in TRAINING}
+    older = {"order": 3}  # which earlier versions stored where none was stated
+    stored = {
+        name: value
+        for name, value in state.settings.items()
+        if name in settings or name not in TRAINING or older.get(name, value) != value
+    }
     if stored.get("plant") != settings["plant"]:
         raise ForeignFileError(f"is the state of plant {stored.get('plant')!r}, not of {settings['plant']!r}")
     if stored != settings:
@@ -163,4 +168,5 @@ def open_state(data: bytes, settings: dict[str, Any]) -> MonitorState:
 
 def _difference(before: dict[str, Any], now: dict[str, Any]) -> str:
     names = [name for name in sorted(before | now) if before.get(name) != now.get(name)]
-    return ", ".join(f"{name} was {before.get(name)!r} and is {now.get(name)!r}" for name in names)
+    states = [[repr(item[name]) if name in item else "not stated" for item in (before, now)] for name in names]
+    return ", ".join(f"{name} was {was} and is {value}" for name, (was, value) in zip(names, states, strict=True))

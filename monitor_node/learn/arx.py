@@ -22,7 +22,7 @@ Snapshots are in the signals' own units.
 """
 
 from collections.abc import Iterator, Sequence
-from math import isfinite, nan, sqrt
+from math import inf, isfinite, nan, sqrt
 from typing import Self
 
 import msgspec
@@ -158,6 +158,8 @@ class ArxPredictor(Memory, dict=True):
         learning: False while an adaptive model that judges does not learn.
         leverage_gain: variance of a residual per unit of its row's leverage, in units of that without leverage: 1 for
             a plant that the model describes, more for others.
+        largest_sd: largest standard deviation by leverage that is believed. A sensor that is off takes its own past
+            where the training never was, and would else excuse itself.
         weight: rows for which a row of the training counts in an adaptive model that judges.
     """
 
@@ -175,6 +177,7 @@ class ArxPredictor(Memory, dict=True):
     copied_rows: int = 0
     learning: bool = True
     leverage_gain: float = 0.0
+    largest_sd: float = inf
     weight: float = 1.0
 
     def __post_init__(self) -> None:
@@ -261,9 +264,8 @@ class ArxPredictor(Memory, dict=True):
     def _learn_carefully(self, regressor: Array, scaled: float) -> float:
         """Learn from a row where nothing is wrong; returns the prediction before."""
         prediction = self.rls.predict(regressor)
-        variance = 1.0 + self.leverage_gain * self.rls.leverage(regressor)
-        self.sd = sqrt(variance)
-        if self.learning and (scaled - prediction) ** 2 <= GATE**2 * self.rls.noise_variance * variance:
+        self.sd = min(sqrt(1.0 + self.leverage_gain * self.rls.leverage(regressor)), self.largest_sd)
+        if self.learning and (scaled - prediction) ** 2 <= (GATE * self.sd) ** 2 * self.rls.noise_variance:
             self.rls.update(regressor, scaled)
             self.copied_rows += 1
             if self.copied_rows == COPY_ROWS:

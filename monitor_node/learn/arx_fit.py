@@ -91,6 +91,7 @@ def _fit_model(models: ArxReference, index: int, rows: RowArrays, to_judge: bool
         held_out, leverage = held_out_residuals(regressors, y)
         model.leverage_gain = fit_leverage_gain(held_out, leverage)
         sd = np.sqrt(1.0 + model.leverage_gain * leverage)
+        model.largest_sd = 1.3 * float(sd.max())  # as of a black box
         residual[scaled.position] = scaling.output_spreads[0] * held_out / sd
     else:
         # With n parameters fitted to N rows, in-sample residuals are sqrt((N - n) / (N + n)) of out-of-sample ones.
@@ -169,7 +170,8 @@ def fit_leverage_gain(residual: Array, leverage: Array) -> float:
     """
     gains = 2.0 ** np.arange(7)
     variances = 1.0 + gains[:, None] * leverage
-    badness = np.log(variances).mean(axis=1) + np.log(np.mean(residual**2 / variances, axis=1))
+    squares = np.mean(residual**2 / variances, axis=1)
+    badness = np.log(variances).mean(axis=1) + np.log(np.maximum(squares, 1e-300))  # 0 for a constant output
     return float(gains[np.argmin(badness)])
 
 

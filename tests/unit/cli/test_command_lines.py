@@ -227,7 +227,7 @@ def test_a_site_in_any_half_made_state_is_completed_or_refused_in_one_line(
         ("demo --duration inf -o new", "duration_min must be above 0"),
         ("demo --seed -1 -o new", "seed must be in"),
         ("demo --site site -o new", "router settings"),
-        ("up --config promise.toml -o new", "settings [monitor]: false_alarms_per_30_days must be in [0.039, "),
+        ("up --config promise.toml -o new", "settings [monitor]: false_alarms_per_30_days must be in [0.048, "),
     ],
 )
 def test_the_line_names_the_rule(folder: Path, typed: str, said: str, monkeypatch: Patch, capsys: Shown) -> None:

@@ -46,7 +46,7 @@ def test_the_second_training_of_a_kind_of_plant_makes_no_filter_again(warm: Run)
     assert job is not None
     first, made = find_deviations(job), row_function.cache_info().misses
     assert find_deviations(job) == first
-    assert row_function.cache_info().misses - made <= 2  # of the equations with what this training was like
+    assert row_function.cache_info().misses - made <= 3  # of the equations with what this training was like
 
 
 def test_the_change_holds_from_the_next_row_on_and_is_published_with_its_time(warm: Run) -> None:

@@ -148,7 +148,7 @@ def test_what_was_learned_with_other_settings_is_kept_aside_and_the_setting_name
     node.on_stop(0)
     other = start_node(msgspec.structs.replace(config, order=2), 0)
     assert own(other).rows == 0
-    assert "was learned with other settings: order was 3 and is 2; it is kept as" in capsys.readouterr().out
+    assert "was learned with other settings: order was not stated and is 2; it is kept as" in capsys.readouterr().out
     path = Path(str(config.state_file))
     path.with_name("monitor.state.other-settings").replace(path)
     assert own(start_node(config, 0)).rows == 10
