@@ -108,13 +108,14 @@ class TrainingResult(NamedTuple):
         after_moves = self.after_moves._replace(size=max(self.after_moves.size / factor, 1.0))
         return self._replace(learned=learned, e=e / factor, after_moves=after_moves)
 
-    def excess_rate(self, arl0: float) -> float:
+    def excess_rate(self, arl0: float, alarms: int) -> float:
         """Times as many false alarms as promised, by what the training shows of moves of the inputs.
 
-        Where it did not determine the dynamics, each new set point may raise every alarm, and the next may come within
-        the length of the training.
+        Where it did not determine the dynamics, each new set point may raise alarms, and the next may come within the
+        length of the training: one event, however many of the alarms it raises.
         """
-        return max(self.after_moves.excess_rate(arl0), arl0 / len(self.z) if self.weakness else 0.0)
+        once = arl0 / (len(self.z) * max(alarms, 1))
+        return max(self.after_moves.excess_rate(arl0), once if self.weakness else 0.0)
 
 
 def fewest_values(config: MonitorConfig, model: ProcessModel | None) -> int:

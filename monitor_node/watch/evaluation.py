@@ -201,7 +201,7 @@ class Evaluation:
         values, e = trained.measured.T.tolist(), trained.e.T.tolist()
         self.signals.start(CheckTraining(values, e, trained.outliers, period_ns, arl0))
         rates, mean_rate = self._alarm_rates(trained, arl0), self.chance_alarms / arl0
-        self.promises.start(rates, mean_rate, period_min, trained.excess_rate(arl0))
+        self.promises.start(rates, mean_rate, period_min, trained.excess_rate(arl0, self.chance_alarms))
         memory.promise = self.promises.promise
         if not again:
             self.notes += self.drift.start(self.models.predictors, self.evaluated, arl0)
