@@ -18,6 +18,7 @@ from reactorwatch.spc.charts.cusum import Cusum
 from reactorwatch.spc.charts.ewma import Ewma
 from reactorwatch.spc.charts.level import Level
 from reactorwatch.spc.charts.level import count_numbers as count_level_numbers
+from reactorwatch.spc.charts.level import numbers_in_kernel as level_numbers_in_kernel
 from reactorwatch.spc.charts.mewma import Mewma, count_numbers
 from reactorwatch.spc.charts.shewhart import Shewhart
 from reactorwatch.spc.compiled_chart import SETTINGS
@@ -187,7 +188,7 @@ def plant_at(frame: Words) -> Plant:
         carray(pointer_at(frame[_P + 7]), (_EWMA, outputs), np.float64),
         carray(pointer_at(frame[_P + 8]), (_CUSUM, outputs), np.float64),
         carray(pointer_at(frame[_P + 9]), (1 + 2 * outputs + 2 * outputs * outputs,), np.float64),
-        carray(pointer_at(frame[_P + 10]), (count_level_numbers(inputs, outputs),), np.float64),
+        carray(pointer_at(frame[_P + 10]), (level_numbers_in_kernel(inputs, outputs),), np.float64),
         carray(pointer_at(frame[_P + 11]), (1 + inputs + outputs,), np.int64),
         carray(pointer_at(frame[_P + 12]), (alarms,), DELAY),
     )

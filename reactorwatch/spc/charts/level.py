@@ -43,8 +43,7 @@ class _Parts(NamedTuple):
     end: int
 
 
-@inline
-def _parts_of(inputs: int, outputs: int) -> _Parts:
+def _lay_out(inputs: int, outputs: int) -> _Parts:
     explaining = inputs * LAGS
     centres, averages = _HEAD, _HEAD + inputs + outputs
     scales = averages + explaining + outputs
@@ -54,6 +53,9 @@ def _parts_of(inputs: int, outputs: int) -> _Parts:
     return _Parts(
         centres, averages, scales, scales + outputs, gains, ranges, leverage, leverage + explaining * explaining
     )
+
+
+_parts_of = inline(_lay_out)  # for kernels; Python takes the function, which needs no compiler
 
 
 @jit
@@ -98,9 +100,14 @@ def move(numbers: Array, x: Array) -> float:
 _MOVE = Entry(move)
 
 
-@inline
 def count_numbers(inputs: int, outputs: int) -> int:
     """Number of numbers of a chart of so many signals, see `LevelMemory`."""
+    return _lay_out(inputs, outputs).end
+
+
+@inline
+def numbers_in_kernel(inputs: int, outputs: int) -> int:
+    """The same for kernels."""
     return _parts_of(inputs, outputs).end
 
 
@@ -175,7 +182,7 @@ class Level(ValueChart):
         p, explaining = len(self.names) - k, k * LAGS
         if k < 0 or p < 1 or numbers.size != count_numbers(k, p) or not np.all(np.isfinite(numbers)):
             raise ValueError(f"numbers of {len(self.names)} signals must be finite, got {numbers.tolist()}")
-        self._inputs, self.limit, at = k, float(numbers[LIMIT]), _parts_of(k, p)
+        self._inputs, self.limit, at = k, float(numbers[LIMIT]), _lay_out(k, p)
         self._centres = numbers[at.centres : at.averages]
         self._averages = numbers[at.averages : at.scales]
         self._scales, self._doubts = numbers[at.scales : at.doubts], numbers[at.doubts : at.gains]
