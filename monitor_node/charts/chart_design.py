@@ -63,18 +63,16 @@ class ChartDesign:
         evaluated: for each output, True if it is evaluated.
         signals: signals of the charts of values.
         is_identified: True if identified models predict.
-        has_equations: True if equations predict: they know how far an input moves the outputs, and where that is not
-            in proportion, so slow changes are those of their residuals. `level` is not made beside other charts.
     """
 
     def __init__(self, config: MonitorConfig) -> None:
-        self._config, self.is_identified, self.has_equations = config, False, False
+        self._config, self.is_identified = config, False
         self.names = list[str](dict.fromkeys(name for name, _ in alarm_names(config)))
         self.chosen: list[str] = []
         self.evaluated: list[bool] = []
         self.signals: tuple[str, ...] = ()
 
-    def choose(self, evaluated: list[bool], e: Array, values: Array) -> dict[str, str]:
+    def choose(self, evaluated: list[bool], e: Array, values: Array, *, has_equations: bool) -> dict[str, str]:
         """Choose the charts that can be made; returns the others, by alarm, each with the reason.
 
         Args:
@@ -82,6 +80,8 @@ class ChartDesign:
             e: the training's prewhitened residuals, shape (n, outputs); NaN where there is none.
             values: its measured values, shape (n, signals), the inputs first; NaN where missing, for each row of a
                 signal that is left out.
+            has_equations: True if equations predict: they know how far an input moves the outputs, and where that is
+                not in proportion, so slow changes are those of their residuals. `level` is then made alone only.
         """
         rows = complete_rows(e, np.flatnonzero(evaluated).tolist())
         signals = list(compress(self._config.outputs, evaluated))
@@ -98,7 +98,7 @@ class ChartDesign:
             if issubclass(kind := chart(name), ValueChart) and (why := kind.obstacle(baseline))
         }
         charts = [name for name in dict.fromkeys(self._config.charts) if name in self.names and name not in obstacles]
-        if self.has_equations and self._config.inputs and set(charts) - {Level.name}:
+        if has_equations and self._config.inputs and set(charts) - {Level.name}:
             charts = [name for name in charts if name != Level.name]
         if not set(charts) - {Level.name} and len(charts) < len(self._config.charts):  # it sees slow changes only
             charts = [name for name in self.names if name not in obstacles]

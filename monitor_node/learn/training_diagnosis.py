@@ -344,15 +344,13 @@ class _NoiseFitter:
         new = np.array([name not in known for name in model.state_names])
         scales = np.array([state.scale for state in model.states])
         before = np.array([known.get(name, 0.0) for name in model.state_names])
-        columns = model_outputs(self._model, self._outputs, self._rows.outputs)
         tried = [
             NoiseLevels(levels.measurement_sd, tuple(np.where(new, share * scales, before).tolist()))
             for share in (3.0, 1.0, 0.3, 0.1, 0.03, 0.01)
         ]
-        record = FilterRecord(self._rows.time_min, self._rows.inputs, columns)
         smallest = [1e-9] * len(model.outputs)  # levels that were fitted keep the true bounds
         times = first_times(self._model, (*item.uncertain, *added), self._rows) | dict(item.noise.parameters)
-        return min(losses_nearby(model.with_values(times) if times else model, record, smallest, tried))
+        return min(losses_nearby(model.with_values(times) if times else model, self._record, smallest, tried))
 
     def drop_disturbances(self, item: _Fit) -> bool:
         """Leave out disturbed intervals and outliers, as a training does; returns true if there are any."""
@@ -366,8 +364,12 @@ class _NoiseFitter:
 
     def filter(self, item: _Fit) -> FilterResult:
         """Filter the rows; the filter then stands at the last."""
+        return item.filter.run(self._record)
+
+    @property
+    def _record(self) -> FilterRecord:
         columns = model_outputs(self._model, self._outputs, self._rows.outputs)
-        return item.filter.run(FilterRecord(self._rows.time_min, self._rows.inputs, columns, GATE))
+        return FilterRecord(self._rows.time_min, self._rows.inputs, columns, GATE)
 
     def are_coloured(self, item: _Fit) -> bool:
         """True if the innovations are not white."""

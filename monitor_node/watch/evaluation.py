@@ -181,8 +181,9 @@ class Evaluation:
         """Start to evaluate rows, or `again` by another model: the drift of the identified models then goes on."""
         self._leave_out(trained.left_out)
         self.charts.design.is_identified = trained.reference.is_identified
-        self.charts.design.has_equations = trained.reference.follows_equations
-        unmade = self.charts.design.choose(self.evaluated, trained.e, trained.values)
+        unmade = self.charts.design.choose(
+            self.evaluated, trained.e, trained.values, has_equations=trained.reference.follows_equations
+        )
         self.shift.is_active = trained.responses is not None and not self._config.has_values_only
         trained.checks.extend(
             Check(name="charts", result=f"{alarm} is left out: {why}") for alarm, why in unmade.items()

@@ -14,13 +14,12 @@
 """
 
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from math import inf
 
 import numpy as np
 from numpy.typing import NDArray
 
-from reactorwatch.arrays import Array
+from reactorwatch.arrays import Array, block_bounds
 from reactorwatch.errors import InputError
 from reactorwatch.identification.black_box_filter import BlackBoxFilter
 from reactorwatch.identification.black_box_model import (
@@ -140,10 +139,6 @@ def fit_black_box(
     return best[2]
 
 
-BLOCKS = 5
-"""Blocks of the training, as in the other cross-validations of a training (`spc.charts.value_chart`)."""
-
-
 OUTERMOST = 0.01
 """Share of the rows with the least values of an output, and of those with the largest, that are held out: as far beyond
 the others as the values of a watch that is a hundred times as long are beyond those of the training, if tails are
@@ -197,7 +192,7 @@ def held_out_residuals(
 def _held_out_rows(y: Array) -> list[NDArray[np.bool_]]:
     """Flags of the rows that are held out at a time: blocks, and the outermost values, beyond which others will be."""
     rows, found = np.arange(len(y)), []
-    for first, end in pairwise(np.linspace(0, len(y), BLOCKS + 1).astype(int).tolist()):
+    for first, end in block_bounds(len(y)):
         found.append((first <= rows) & (rows < end))
     low, high = np.nanquantile(y, (OUTERMOST, 1.0 - OUTERMOST), axis=0)
     return [*found, *(y < low).T, *(y > high).T]

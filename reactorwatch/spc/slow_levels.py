@@ -31,13 +31,12 @@ whose response is that of the others (`largest_in_blocks`).
 """
 
 from collections.abc import Callable, Sequence
-from itertools import pairwise
 from typing import NamedTuple, Self
 
 import numpy as np
 from scipy import special
 
-from reactorwatch.arrays import Array
+from reactorwatch.arrays import Array, block_bounds
 
 FEWEST_SAMPLES = 10
 """Least number of samples beside two for each input; of fewer, Student's limits are beyond what a fault does."""
@@ -51,10 +50,6 @@ their mixture to some percent; of slower ones a training of 1,000 rows does not 
 
 SETS = ((0,), (1,), (2,), (3,), (0, 1), (1, 2), (2, 3))
 """Sets of averages of the inputs, of which one explains an output: a lag, or one between two neighbours."""
-
-
-BLOCKS = 5
-"""Blocks of the training, as in the other cross-validations of a training (`spc.charts.value_chart`)."""
 
 
 class InputResponse(NamedTuple):
@@ -234,15 +229,15 @@ def largest_in_blocks(driving: Array, averages: Array, sets: Sequence[tuple[int,
         averages: averages of the outputs, shape (rows, p).
         sets: lags that explain each output.
     """
-    found, bounds = np.zeros(len(sets)), np.linspace(0, len(averages), BLOCKS + 1).astype(int)
-    for first, end in pairwise(bounds.tolist()):
-        others = np.r_[0:first, end : len(averages)]
-        for i, lags in enumerate(sets):
-            design = np.column_stack([np.ones(len(averages)), driving[:, :, list(lags)].reshape(len(averages), -1)])
-            coefficients = np.linalg.lstsq(design[others], averages[others, i])[0]
-            sizes = np.abs(averages[first:end, i] - design[first:end] @ coefficients)
-            found[i] = max(found[i], float(sizes.max()))
-    return found
+    rows, found = len(averages), []
+    for average, lags in zip(averages.T, sets, strict=True):
+        design, levels = np.column_stack([np.ones(rows), driving[:, :, list(lags)].reshape(rows, -1)]), np.empty(rows)
+        for first, end in block_bounds(rows):
+            others = np.r_[0:first, end:rows]
+            coefficients = np.linalg.lstsq(design[others], average[others])[0]
+            levels[first:end] = average[first:end] - design[first:end] @ coefficients
+        found.append(np.max(np.abs(levels)))
+    return np.array(found)
 
 
 def sample_spacing(weight: float) -> int:

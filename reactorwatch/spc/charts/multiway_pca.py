@@ -11,10 +11,10 @@ SPE of its deviations are charted row by row. Blocks that are held out are of wh
 
 import numpy as np
 
-from reactorwatch.arrays import Array
+from reactorwatch.arrays import BLOCKS, Array
 from reactorwatch.spc.charts.base import Setting, SignalSetting
 from reactorwatch.spc.charts.pca import Components
-from reactorwatch.spc.charts.value_chart import BLOCKS, Model, StatisticsChart, ValueBaseline
+from reactorwatch.spc.charts.value_chart import Model, StatisticsChart, ValueBaseline
 
 STAGES = 20
 """Number of intervals of a batch; courses are linear within one."""

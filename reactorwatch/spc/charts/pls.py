@@ -12,15 +12,14 @@ each divided by its mean. The quality is needed in the training only: later it m
 of components has the least error of prediction on held-out blocks.
 """
 
-from itertools import pairwise
 from typing import NamedTuple, Self
 
 import numpy as np
 
-from reactorwatch.arrays import Array
+from reactorwatch.arrays import Array, block_bounds
 from reactorwatch.spc.charts.base import Setting, SignalSetting
 from reactorwatch.spc.charts.pca import Components, standardise
-from reactorwatch.spc.charts.value_chart import BLOCKS, Model, StatisticsChart, ValueBaseline
+from reactorwatch.spc.charts.value_chart import Model, StatisticsChart, ValueBaseline
 
 
 class Projection(NamedTuple):
@@ -122,7 +121,7 @@ def choose_components(x: Array, y: Array) -> int:
     """Number of components with the least squared error of prediction on held-out blocks; at most 8."""
     most = min(8, x.shape[1] - 1)  # one less than signals, so that something is left for SPE
     errors = np.zeros(most)
-    for first, end in pairwise(np.linspace(0, len(x), BLOCKS + 1).astype(int).tolist()):
+    for first, end in block_bounds(len(x)):
         others = np.r_[0:first, end : len(x)]
         fitted = Projection.fit(x[others], y[others], most)
         errors += [np.sum((fitted.first(a).predict(x[first:end]) - y[first:end]) ** 2) for a in range(1, most + 1)]

@@ -28,20 +28,18 @@ not below the largest of their averages.
 """
 
 from collections.abc import Sequence
-from itertools import pairwise
 from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy import special
 
-from reactorwatch.arrays import Array
+from reactorwatch.arrays import Array, block_bounds
 from reactorwatch.codegen.numba_kernel import Entry, jit
 from reactorwatch.errors import InputError, positive
 from reactorwatch.spc.charts.base import LARGEST_VALUE, Judgement, Setting, vector
 from reactorwatch.spc.charts.ewma import ewma_limit
 from reactorwatch.spc.charts.value_chart import (
-    BLOCKS,
     ValueBaseline,
     ValueChart,
     adjustment,
@@ -195,7 +193,7 @@ def held_out_residuals(rows: Array) -> Array:
         rows: scaled signals, shape (rows, p).
     """
     residuals = np.empty_like(rows)
-    for first, end in pairwise(np.linspace(0, len(rows), BLOCKS + 1).astype(int).tolist()):
+    for first, end in block_bounds(len(rows)):
         centre, matrix = adjustment(np.concatenate([rows[:first], rows[end:]]))
         residuals[first:end] = (rows[first:end] - centre) @ matrix.T
     return residuals

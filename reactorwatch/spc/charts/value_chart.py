@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import special
 
-from reactorwatch.arrays import Array
+from reactorwatch.arrays import BLOCKS, Array
 from reactorwatch.errors import positive
 from reactorwatch.spc.charts.base import ROWS_A_SIGNAL, Chart, Judgement, vector
 from reactorwatch.spc.charts.ewma import ewma_limit
@@ -32,9 +32,6 @@ from reactorwatch.spc.false_alarm_budget import TrainingErrors, degrees_of_freed
 from reactorwatch.spc.prewhitening import Prewhitening, learn
 from reactorwatch.spc.slow_levels import averages_from_zero
 from reactorwatch.stored_state import Memory
-
-BLOCKS = 5
-"""Blocks of the cross-validation."""
 
 SHRINKAGE = 0.01
 """Share by which correlations are reduced: without it, signals that follow from others have no inverse."""

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
+from reactorwatch.arrays import BLOCKS
 from reactorwatch.spc.charts.residual_space import ResidualSpace, degrees_of_freedom, held_out_residuals, moderate
-from reactorwatch.spc.charts.value_chart import BLOCKS, SHRINKAGE, ValueBaseline, adjustment, average_rows
+from reactorwatch.spc.charts.value_chart import SHRINKAGE, ValueBaseline, adjustment, average_rows
 
 from .members import Array
 

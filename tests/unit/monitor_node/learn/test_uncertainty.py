@@ -70,7 +70,7 @@ def test_noise_with_memory_is_coloured_noise(memory: tuple[float, float]) -> Non
 
 @cache
 def fit_two_tanks(seed: int, wandering: tuple[bool, bool], resolution: float) -> tuple[Uncertain, Array]:
-    """What the first 1,000 rows show, and the innovations of 9,000 later ones."""
+    """Additional states that the first 1,000 rows show, and the innovations of 9,000 later ones."""
     record, model = record_of_two_tanks(seed, 10_000, wander=(0.06 * wandering[0], 0.06 * wandering[1])), two_tanks()
     inputs, measured = (np.column_stack([record.columns[f"{name}{i}"] for i in (1, 2)]) for name in ("F", "h"))
     measured = np.round(measured / resolution) * resolution if resolution else measured
