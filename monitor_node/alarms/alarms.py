@@ -226,13 +226,16 @@ class ChartAlarm:
         self._mask, self._reach = (1 << window) - 1, 1 - dead_band
         self.memory = AlarmMemory()
 
-    def update(self, judgement: Judgement, unit: str = "", time_ns: int | None = None) -> AlarmChange | None:
+    def update(
+        self, judgement: Judgement, unit: str = "", time_ns: int | None = None, *, away: bool = False
+    ) -> AlarmChange | None:
         """Update the alarm's condition with a point of the chart.
 
         Args:
             judgement: the point.
             unit: unit of its statistic.
             time_ns: time of the point; None: that of the row.
+            away: True if the plant is not back, whatever its predictor has learned: then no point is ordinary.
 
         Returns:
             The change, which the annunciator's `apply` has to follow; None if nothing changes.
@@ -240,7 +243,7 @@ class ChartAlarm:
         memory, out = self.memory, bool(judgement.out)
         if not (out or memory.standing or memory.recent):
             return None
-        ordinary = not out and _IS_ORDINARY.call(*judgement[:4], memory.above, self._reach)
+        ordinary = not (out or away) and _IS_ORDINARY.call(*judgement[:4], memory.above, self._reach)
         memory.recent, memory.in_a_row = _ADD_POINT.call(memory.recent, memory.in_a_row, self._mask, out, ordinary)
         if memory.standing:
             if memory.in_a_row < self._clear_count:

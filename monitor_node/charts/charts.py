@@ -103,6 +103,10 @@ class _Charts(ABC):
     def update(self, row: _ChartRow, *, always: bool) -> _Judgements:
         """Judge a row: None for a chart without a value; None in place of all if no chart is out, unless `always`."""
 
+    def is_held(self, index: int, away: list[bool]) -> bool:
+        """True if an alarm stays active as outputs are not back; a chart of values compares them with the training."""
+        return away[index]
+
     @abstractmethod
     def restart(self, index: int) -> None:
         """Forget the rows seen, in the chart of an alarm."""
@@ -182,6 +186,9 @@ class _OfAll(_Single[JointChart]):
         self._last = list(compress(row.e, self._evaluated))
         return self._judge(self._last, always=always)
 
+    def is_held(self, index: int, away: list[bool]) -> bool:
+        return True in compress(away, self._evaluated)
+
     def explain(self, index: int, judgement: Judgement, signals: list[Shown]) -> tuple[str, dict[str, float]]:
         return self._chart.explain(self._last, list(compress(signals, self._evaluated)))
 
@@ -202,6 +209,9 @@ class _OfValues(_Single[ValueChart]):
         x = self._chart.fill(np.array([*row.inputs, *outputs])[self._indices])
         return None if x is None else self._judge(x, always=always)
 
+    def is_held(self, index: int, away: list[bool]) -> bool:
+        return False
+
     def explain(self, index: int, judgement: Judgement, signals: list[Shown]) -> tuple[str, dict[str, float]]:
         return self._chart.explain()
 
@@ -221,6 +231,7 @@ class ChartWatch:
             for pair in alarm_names(config)
         }
         self._watched: dict[str, _Charts] = {}
+        self._level: Level | None = None
         self.memory = ChartsMemory()
 
     def _priority(self, signal: str) -> PriorityName | None:
@@ -228,6 +239,14 @@ class ChartWatch:
             return None
         ranks: tuple[PriorityName, ...] = ("low", "medium", "high", "critical")
         return max((self._config.priorities.get(name, "medium") for name in self._config.outputs), key=ranks.index)
+
+    @property
+    def away(self) -> list[bool] | None:
+        """For each output, True if its level is not back, see `Level.away`; None without a chart of levels."""
+        if self._level is None:
+            return None
+        away = self._level.away
+        return [name in away for name in self._config.outputs]
 
     @property
     def is_ordinary(self) -> bool:
@@ -340,7 +359,9 @@ class ChartWatch:
 
     def _watch(self, make: Callable[[type[Chart]], _Made]) -> None:
         """Make the charts of each name, and give them their alarms and keys."""
-        self._watched = {name: self._charts(make(chart(name))) for name in self.design.chosen}
+        made = {name: make(chart(name)) for name in self.design.chosen}
+        self._level = next((item for item in made.values() if isinstance(item, Level)), None)
+        self._watched = {name: self._charts(item) for name, item in made.items()}
         self.memory.charts = {name: charts.memory for name, charts in self._watched.items()}
         for name, charts in self._watched.items():
             pairs = [pair for pair in self._alarms if pair[0] == name]
@@ -356,7 +377,14 @@ class ChartWatch:
         return _Banked(made) if isinstance(made, Bank) else _OfEach(made)
 
     def update(
-        self, row: MeasuredRow, e: list[float], withheld: tuple[bool, ...], scales: list[float], *, points: bool
+        self,
+        row: MeasuredRow,
+        e: list[float],
+        withheld: tuple[bool, ...],
+        scales: list[float],
+        *,
+        away: list[bool],
+        points: bool,
     ) -> list[AlarmChange]:
         """Evaluate a row; returns the changes of alarms.
 
@@ -365,6 +393,7 @@ class ChartWatch:
             e: prewhitened residuals; NaN where there is none.
             withheld: outputs whose value may be an outlier and must not enter a memory yet.
             scales: one standard deviation of each, in the outputs' units.
+            away: for each output, True if it is not back.
             points: True to publish the charts' points.
         """
         known = [size == size for size in e]  # NaN is not equal to itself
@@ -379,7 +408,7 @@ class ChartWatch:
                 alarm = charts.alarms[index]
                 if not (judgement.out or alarm.memory.standing or alarm.memory.recent):
                     continue  # such a point changes no alarm
-                change = alarm.update(judgement, SD)
+                change = alarm.update(judgement, SD, away=charts.is_held(index, away))
                 if change is None:
                     continue
                 if change.is_raised:

@@ -97,8 +97,8 @@ class ShiftWatch:
         if self._tests is not None:
             self._tests.restart()
 
-    def update(self, row: MeasuredRow, z: list[float], *, points: bool) -> list[AlarmChange]:
-        """Test a row; returns the changes of alarms."""
+    def update(self, row: MeasuredRow, z: list[float], *, away: list[bool], points: bool) -> list[AlarmChange]:
+        """Test a row; returns the changes of alarms. For `away` see `ChartWatch.update`."""
         changes: list[AlarmChange] = []
         if self._tests is None:
             return changes
@@ -114,7 +114,7 @@ class ShiftWatch:
             judgement = Judgement(point.statistic, 0.0, -point.limit, point.limit, abs(point.statistic) > point.limit)
             if points:
                 row.publications.append(Publication(self._keys[i], chart_point(row.time_ns, judgement)))
-            if (change := alarm.update(judgement, "sd")) is None:
+            if (change := alarm.update(judgement, "sd", away=away[i])) is None:
                 continue
             name, step = self._outputs[i], format_quantity(point.size, row.units[i], "+.3g")
             change.text = f"{name} moved by {step} {point.rows} rows before and {STAYED}"

@@ -122,6 +122,7 @@ class Evaluation:
         self.whitened_sds: list[float] = []
         self.memory = self._new_memory()
         self.evaluated = [True] * len(config.outputs)
+        self.nowhere = [False] * len(config.outputs)
         self.notes: list[str] = []
 
     # --- memory ----------------------------------------------------------------------------------------------
@@ -276,6 +277,10 @@ class Evaluation:
         self._use_ranges()
         self.memory, self.promises.promise = self._new_memory(), None
         self._leave_out({})
+
+    def find_away(self) -> list[bool]:
+        """For each output, True if it was not yet back in the row before, while an alarm is active."""
+        return self.charts.away or self.nowhere
 
     def restart(self) -> None:
         """Judge the next row without those before it, as after a gap; charts and alarms keep their memory."""

@@ -222,7 +222,7 @@ class PlantPipeline:
             scales = [sd * whitened for sd, whitened in zip(sds, evaluation.whitened_sds, strict=True)]
             self._publish_estimates(row, predictions, sds, scales)
             row.publications.extend(charts.points(time_ns, points))
-        changes = shift.update(row, z, points=self._points) if shift.is_active else []
+        changes = shift.update(row, z, away=evaluation.nowhere, points=self._points) if shift.is_active else []
         self._end_row(row, changes, before)
         if self._board.has_unexplained:  # a lasting step
             evaluation.leave_ordinary()
@@ -292,9 +292,10 @@ class PlantPipeline:
             for whitener, outlier in zip(evaluation.whiteners, quarantined, strict=True):
                 if outlier:
                     whitener.reject_last()
-        changes += charts.update(row, e, quarantined, scales, points=self._points)
+        away = evaluation.find_away() if self._board.has_unexplained else evaluation.nowhere
+        changes += charts.update(row, e, quarantined, scales, away=away, points=self._points)
         if shift.is_active:
-            changes += shift.update(row, tested, points=self._points)
+            changes += shift.update(row, tested, away=away, points=self._points)
         if self._board.has_unexplained:
             changes += evaluation.change.update(row, points=self._points)
         self._end_row(row, changes, before, stuck)

@@ -162,6 +162,13 @@ class SlowLevels(NamedTuple):
         beyond = special.stdtr(self.freedom, -limits / np.sqrt(self.variances + self.errors))
         return crossing_rate(-special.ndtri(np.maximum(beyond, 1e-300)), self.steps / self.variances)
 
+    def usual(self, share: float) -> Array:
+        """Size of each level beyond which a share of sound rows is, on average over the memories."""
+        sds = np.sqrt(self.variances + self.errors)
+        return self._limits(
+            lambda sizes: 2.0 * np.sum(self.weights * special.stdtr(self.freedom, -sizes / sds), axis=0), 1.0 / share
+        )
+
     def limits(self, arl0: float) -> Array:
         """Limit of each level: crossed once in `arl0` rows on average over the memories, or by the largest so far."""
 

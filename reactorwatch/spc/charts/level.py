@@ -27,6 +27,10 @@ from reactorwatch.spc.false_alarm_budget import TrainingErrors
 from reactorwatch.spc.slow_levels import FEWEST_SAMPLES, LAGS, InputResponse, SlowLevels, sample_spacing
 from reactorwatch.stored_state import Memory
 
+AWAY = 0.01
+"""Share of sound rows in which a level counts as away: so few delay the end of an alarm in one of five cases, of twenty
+rows that end it."""
+
 _INPUTS, _WEIGHT, LIMIT, _BEFORE, _SLOWEST, _HEAD = range(6)
 
 
@@ -120,10 +124,12 @@ class LevelMemory(Memory):
             explains an output, its weight; centres of the signals; averages, those of an input together; of each
             output, one unit of the limit, and what inputs before the start may do, in units of the limit; then
             coefficients, ranges and leverage as in `InputResponse`.
+        back: share of its limit within which the level of each output is back, shape (p,).
     """
 
     names: tuple[str, ...]
     numbers: Array
+    back: Array
 
 
 class Level(ValueChart):
@@ -140,6 +146,7 @@ class Level(ValueChart):
         weight: lambda, of the newest row, in (0, 1].
         limit: limit of the averages, in these units.
         response: response to the inputs; None without inputs.
+        back: share of its limit within which the level of each output is back, shape (p,); None: all of it.
 
     Raises:
         InputError: an argument is out of its range, or the shapes differ.
@@ -159,6 +166,7 @@ class Level(ValueChart):
         weight: float,
         limit: float,
         response: InputResponse | None = None,
+        back: Array | None = None,
     ) -> None:
         if not 0.0 < weight <= 1.0:
             raise InputError(f"weight (lambda) must be in (0, 1], got {weight}")
@@ -173,14 +181,15 @@ class Level(ValueChart):
         parts = given.gains.ravel(), given.ranges, given.leverage.ravel()
         averages = np.zeros(k * LAGS + p)
         numbers = np.concatenate([head, middle, averages, units, given.before / limit, *parts])
-        self._use(LevelMemory(tuple(names), numbers))
+        self._use(LevelMemory(tuple(names), numbers, np.ones(p) if back is None else back))
 
     def _use(self, memory: LevelMemory) -> None:
         """See `Chart`."""
         self.memory, self.names, numbers = memory, memory.names, memory.numbers
         k = int(numbers[_INPUTS]) if numbers.size >= _HEAD else -1
         p, explaining = len(self.names) - k, k * LAGS
-        if k < 0 or p < 1 or numbers.size != count_numbers(k, p) or not np.all(np.isfinite(numbers)):
+        is_whole = k >= 0 and p >= 1 and numbers.size == count_numbers(k, p) and memory.back.shape == (p,)
+        if not (is_whole and np.all(np.isfinite(numbers))):
             raise ValueError(f"numbers of {len(self.names)} signals must be finite, got {numbers.tolist()}")
         self._inputs, self.limit, at = k, float(numbers[LIMIT]), _lay_out(k, p)
         self._centres = numbers[at.centres : at.averages]
@@ -205,8 +214,8 @@ class Level(ValueChart):
         """See `ValueChart`; `level_weight` is the weight of the newest row."""
         slow, weight = _slow_levels(baseline), baseline.settings["level_weight"]
         limits = slow.limits(baseline.arl0)
-        limit = float(np.max(limits / slow.sds))
-        return cls(baseline.names, slow.centres, limits / limit, weight, limit, slow.response)
+        limit, back = float(np.max(limits / slow.sds)), slow.usual(AWAY) / limits
+        return cls(baseline.names, slow.centres, limits / limit, weight, limit, slow.response, back)
 
     @classmethod
     def relative_rates(cls, baseline: ValueBaseline) -> Array:
@@ -252,11 +261,7 @@ class Level(ValueChart):
 
     def explain(self) -> tuple[str, dict[str, float]]:
         """See `ValueChart`: the outputs outside their training, and shares of the squared deviations."""
-        k, (driving, own) = self._inputs, np.split(self._averages, [self._gains.shape[1]])
-        usual, levels = self._centres[k:] + self._gains @ driving, self._centres[k:] + own
-        beyond = max([1.0, *((driving[::LAGS] / self._ranges) ** 2)])
-        wide = beyond * np.sqrt(1.0 + driving @ self._leverage @ driving)
-        reach = self.limit * (wide * self._scales + self.memory.numbers[_BEFORE] * self._doubts)
+        k, (levels, usual, reach) = self._inputs, self._levels()
         sizes = (levels - usual) / reach
         order = np.argsort(-np.abs(sizes), kind="stable").tolist()
         outside = [i for i in order if abs(sizes[i]) > 1.0] or order[:1]
@@ -267,6 +272,21 @@ class Level(ValueChart):
         ]
         shares = sizes**2 / np.sum(sizes**2)
         return f"outside its training: {' and '.join(named)}", {self.names[k + i]: float(shares[i]) for i in order}
+
+    @property
+    def away(self) -> list[str]:
+        """Outputs whose level is farther from the training than in all but one of a hundred sound rows."""
+        levels, usual, reach = self._levels()
+        away = np.abs(levels - usual) > self.memory.back * reach
+        return [self.names[self._inputs + i] for i in np.flatnonzero(away).tolist()]
+
+    def _levels(self) -> tuple[Array, Array, Array]:
+        """Level of each output, what is usual with these inputs, and how far from it the limit is."""
+        k, (driving, own) = self._inputs, np.split(self._averages, [self._gains.shape[1]])
+        usual, levels = self._centres[k:] + self._gains @ driving, self._centres[k:] + own
+        beyond = max([1.0, *((driving[::LAGS] / self._ranges) ** 2)])
+        wide = beyond * np.sqrt(1.0 + driving @ self._leverage @ driving)
+        return levels, usual, self.limit * (wide * self._scales + self.memory.numbers[_BEFORE] * self._doubts)
 
     def restart(self) -> None:
         """Forget the rows seen."""

@@ -172,3 +172,27 @@ def test_a_training_too_short_for_slow_changes_is_refused() -> None:
     short = Level.obstacle(baseline_of(wandering(rng, 200, 2), inputs=1))
     assert short == "the training has 200 rows with all signals, 247 are needed for slow changes"
     assert Level.obstacle(baseline_of(wandering(rng, 247, 2), inputs=1)) == ""
+
+
+@pytest.mark.parametrize("phi", [0.0, 0.9, PHI])
+def test_a_hundredth_of_sound_rows_is_away(phi: float) -> None:
+    """Simulated, on average over trainings; rather fewer, as the memory is uncertain."""
+    rng, shares = np.random.default_rng(11), []
+    for _ in range(100):
+        values = wandering(rng, 1000 + ROWS, 1, phi)
+        chart = Level.design(baseline_of(values[:1000]))
+        averages = signal.lfilter([0.1], [1.0, -0.9], values[1000:] - chart._centres, axis=0)
+        shares.append(np.mean(np.abs(averages) > chart.limit * chart._scales * chart.memory.back))
+    assert 0.003 < np.mean(shares) < 0.013
+
+
+def test_an_output_is_away_until_its_level_is_back() -> None:
+    rng = np.random.default_rng(12)
+    values = wandering(rng, 1500, 2, 0.5)
+    values[1100:1300, 1] += 8.0
+    chart, away = Level.design(baseline_of(values[:1000])), []
+    for row in values[1000:]:
+        chart.update(row)
+        away.append(chart.away)
+    assert all("s1" in names for names in away[110:300])
+    assert not any("s1" in names for names in away[330:360])
