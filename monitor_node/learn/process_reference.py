@@ -3,6 +3,7 @@
 It is nonlinear, so inputs beyond the training and irregular rows are no problem.
 """
 
+from dataclasses import replace
 from functools import lru_cache
 from math import isfinite, nan
 
@@ -19,14 +20,17 @@ from reactorwatch.errors import InputError
 from reactorwatch.kalman.batch import GATE, LONGEST_ROW_MIN, FilterRecord
 from reactorwatch.kalman.ekf import Filter, FilterState
 from reactorwatch.kalman.ekf_step import NoiseLevels, row_function
-from reactorwatch.kalman.filter_states import is_disturbance, learned_parameters, widen_model
-from reactorwatch.kalman.noise_estimation import NoiseFit, fit_noise, noise_starts
+from reactorwatch.kalman.filter_states import NOISE, is_disturbance, learned_parameters, widen_model
+from reactorwatch.kalman.noise_estimation import NoiseFit, fit_noise, is_coarse, losses_nearby, noise_starts
 from reactorwatch.process.model import MODEL_CACHE_SIZE, ProcessModel
 from reactorwatch.records.record import MINUTE_NS
 from reactorwatch.stored_state import Memory, copy_of
 
 WANDER_ROWS = 10.0
 """Time constant of a wandering input, in rows, at which its search starts."""
+
+ROUNDING_ROWS = 3.0
+"""Time constant of a coarse sensor's rounding errors, in rows, at which its search starts."""
 
 
 class ProcessMemory(Memory, tag="process"):
@@ -115,7 +119,8 @@ class ProcessReference(FilterReference):
         if not any(map(is_disturbance, model.uncertain)):
             return cls(model, outputs, ProcessMemory(found.levels, learned))
         alone = fit_training_noise(model, outputs, rows, smallest_sd, ())
-        return cls(model, outputs, ProcessMemory(found.levels, learned, alone.levels))
+        loudest = loudest_disturbances(widen_model(model, model.uncertain, learned), found.levels, outputs, rows)
+        return cls(model, outputs, ProcessMemory(loudest, learned, alone.levels))
 
     @property
     def memory(self) -> ProcessMemory:
@@ -349,17 +354,58 @@ def fit_training_noise(
     columns, smallest = model_outputs(model, outputs, rows.outputs), [1e-6] * len(model.outputs)
     for i, sd in zip(output_indices(model, outputs), smallest_sd, strict=True):
         smallest[i] = sd
-    wide, starts = widen_model(model, uncertain), first_times(model, uncertain, rows)
+    wide, times = widen_model(model, uncertain), first_times(model, outputs, uncertain, rows)
+    if times:
+        wide = wide.with_values(times)
+        # Rounding errors of more than some ten rows would take the place of what moves the plant.
+        limits = {name: 3.0 * value for name, value in times.items() if name.endswith(".memory_min")}
+        bounded = (replace(item, upper=limits.get(item.name, item.upper)) for item in wide.parameters)
+        wide = replace(wide, parameters=tuple(bounded))
+    starts = noise_starts(wide, columns, smallest)
+    # Where a part of the noise has memory, only the rest is white. A sensor with less of it could pass for exact.
+    white = [0.5 if f"{NOISE} {name}" in uncertain else 1.0 for name in model.output_names]
     return fit_noise(
-        wide.with_values(starts) if starts else wide,
+        wide,
         FilterRecord(rows.time_min, _mask_before_missing(rows.time_min, rows.inputs), columns),
-        smallest,
+        [share * sd for share, sd in zip(white, smallest, strict=True)],
         learned_parameters(model, uncertain),
-        nearby=noise_starts(model, uncertain, columns, smallest),
+        nearby=starts.nearby,
+        apart=starts.apart,
     )
 
 
-def first_times(model: ProcessModel, uncertain: tuple[str, ...], rows: RowArrays) -> dict[str, float]:
-    """Time constants in minutes of inputs that wander at which their search starts, by name of the parameter."""
-    first_min = WANDER_ROWS * float(np.median(np.diff(rows.time_min)))
-    return {name: first_min for name in learned_parameters(model, uncertain) if name.endswith(".wander_min")}
+def loudest_disturbances(
+    model: ProcessModel, levels: NoiseLevels, outputs: tuple[str, ...], rows: RowArrays
+) -> NoiseLevels:
+    """The noise levels with the loudest disturbances that the training hardly tells from these.
+
+    A training is a few time constants of what wanders slowly. Half of a disturbance that is understated is left in the
+    residuals and adds up over many rows, and the promise is broken; one that is overstated costs a little power.
+    """
+    columns = model_outputs(model, outputs, rows.outputs)
+    record = FilterRecord(rows.time_min, _mask_before_missing(rows.time_min, rows.inputs), columns, GATE)
+    of_sensor = np.array([name.endswith(".memory") for name in model.state_names])
+    sds = np.array(levels.process_sd)
+    tried = [
+        NoiseLevels(levels.measurement_sd, tuple(np.where(of_sensor, sds, size * sds).tolist()))
+        for size in 1.1 ** np.arange(8.0)
+    ]
+    losses = np.array(losses_nearby(model, record, [1e-9] * len(model.outputs), tried))
+    return tried[int(np.flatnonzero(losses <= losses[0] + 2.0)[-1])]  # as by Akaike's criterion
+
+
+def first_times(
+    model: ProcessModel, outputs: tuple[str, ...], uncertain: tuple[str, ...], rows: RowArrays
+) -> dict[str, float]:
+    """Time constants in minutes at which a search starts that depend on the rows, by name of the parameter.
+
+    They are those of inputs that wander and of rounding errors.
+    """
+    period_min, found = float(np.median(np.diff(rows.time_min))), dict[str, float]()
+    coarse = {f"{name}.memory_min" for name, column in zip(outputs, rows.outputs.T, strict=True) if is_coarse(column)}
+    for name in learned_parameters(model, uncertain):
+        if name.endswith(".wander_min"):
+            found[name] = WANDER_ROWS * period_min
+        elif name in coarse:
+            found[name] = ROUNDING_ROWS * period_min
+    return found

@@ -10,6 +10,9 @@ them.
 - Where the rows say that the plant is not quite the equations, or leave open how it follows a move of an input, its
   constants are uncertain (`kalman.filter_states`), and so are predictions until rows have taught them.
 - Where the innovations are coloured even so, the plant has disturbances that wander, or its sensors noise with memory.
+- Rounding errors of a coarse sensor have memory in any case, or they would pass for movements of the plant.
+- White noise left in the balances is taken for inputs that wander, unless the rows speak against it: with these,
+  averages of many rows vary most, and a thousand rows hardly tell which it is.
 
 A plant that equals the equations, and that the training has moved enough, needs neither.
 """
@@ -43,7 +46,7 @@ from reactorwatch.kalman.filter_states import (
     select_effects,
     widen_model,
 )
-from reactorwatch.kalman.noise_estimation import NoiseFit, losses_nearby, resolution_sd
+from reactorwatch.kalman.noise_estimation import NoiseFit, is_coarse, losses_nearby, resolution_sd
 from reactorwatch.process import DEFAULT_PROCESS, effects_of, own_effects
 from reactorwatch.process.effect import Effect, ParameterEffect, ParameterShift
 from reactorwatch.process.extended_model import parse_extended_model, stored_model
@@ -245,7 +248,7 @@ LEAST_ROWS = 100
 """Number of values of each output below which nothing is sought."""
 
 LEAST_GAIN = 8.0
-"""Gain of log likelihood beyond which something is taken for a part of the plant."""
+"""Gain of log likelihood beyond which something is taken for a part of the plant, or for none of it."""
 
 MOST_DISTURBANCES = 4
 """Number of disturbances from which on no further one is sought: a filter of so many more states would be slow."""
@@ -265,16 +268,19 @@ def find_uncertain(model: ProcessModel, outputs: tuple[str, ...], rows: RowArray
     if np.min(np.count_nonzero(np.isfinite(rows.outputs), axis=0), initial=LEAST_ROWS) < LEAST_ROWS:
         return Uncertain()
     fitter = _NoiseFitter(model, outputs, rows)
-    plain = fitter.fit(())
+    coarse = [is_coarse(column) for column in rows.outputs.T]
+    rounding = tuple(f"{NOISE} {name}" for name, is_rounded in zip(outputs, coarse, strict=True) if is_rounded)
+    plain = fitter.fit(rounding)
     if fitter.drop_disturbances(plain):
-        plain = fitter.fit(())
-    x = np.nanmedian(fitter.filter(plain).x, axis=0)
+        plain = fitter.fit(rounding)
+    x = np.nanmedian(fitter.filter(plain).x[:, : len(model.states)], axis=0)
     constants = tuple(f"{CONSTANT} {name}" for name in select_effects(model, x, np.nanmedian(rows.inputs, axis=0)))
     own = tuple(
         f"{CONSTANT} {item.name}" for item in effects_of(model) if isinstance(item, ParameterEffect | ParameterShift)
     )
-    wide, best = fitter.fit(constants), plain
-    for found in (wide, fitter.fit(own)) if 0 < len(own) <= MOST_CONSTANTS else (wide,):
+    own = own if len(own) <= MOST_CONSTANTS else ()
+    wide, best = fitter.fit((*constants, *rounding)), plain
+    for found in (wide, fitter.fit((*own, *rounding))) if own else (wide,):
         if found.noise.loss < min(best.noise.loss, plain.noise.loss - LEAST_GAIN):
             best = found
     most = len(best.uncertain) + MOST_DISTURBANCES
@@ -291,13 +297,20 @@ def find_uncertain(model: ProcessModel, outputs: tuple[str, ...], rows: RowArray
         if found.noise.loss > best.noise.loss - LEAST_GAIN * (len(found.uncertain) - len(best.uncertain)):
             break
         best = found
-    if not {*constants} <= {*best.uncertain}:
-        wide = fitter.fit(tuple(dict.fromkeys((*constants, *best.uncertain)))) if best.uncertain else wide
+    open_constants = not any(item.startswith(CONSTANT) for item in best.uncertain)
+    if best.moves_balances(len(model.states)):
+        # White noise in the balances has no cause; inputs that wander predict more of the same over many rows.
+        names = (*(own if open_constants else ()), *best.uncertain, *inputs)
+        found = fitter.fit(tuple(dict.fromkeys(names)))
+        if found.noise.loss < best.noise.loss + LEAST_GAIN:
+            best, open_constants = found, open_constants and not own
+    if open_constants:
+        wide = fitter.fit(tuple(dict.fromkeys((*constants, *best.uncertain))))
         certain, uncertain = fitter.sds_after_moves(best), fitter.sds_after_moves(wide)
         if np.any(uncertain > 1.25 * certain):  # the training leaves open how the plant follows
             best = wide
-    learned = (best.noise.parameters[name] for name in learned_parameters(model, best.uncertain))
-    return Uncertain(best.uncertain, tuple(learned))
+    names = best.without_idle
+    return Uncertain(names, tuple(best.noise.parameters[name] for name in learned_parameters(model, names)))
 
 
 def describe_uncertain(uncertain: Sequence[str], inputs: Sequence[str]) -> str:
@@ -324,15 +337,36 @@ class _Fit(NamedTuple):
     noise: NoiseFit
     filter: Filter
 
+    @property
+    def sd_by_state(self) -> dict[str, float]:
+        """Process noise by name of the state."""
+        return dict(zip(self.filter.model.state_names, self.noise.levels.process_sd, strict=True))
+
+    def moves_balances(self, states: int) -> bool:
+        """True if there is noise in the states of the equations, which are the first."""
+        return any(self.noise.levels.process_sd[:states])
+
+    @property
+    def without_idle(self) -> tuple[str, ...]:
+        """The uncertain parts without disturbances that the training does not show."""
+        suffix, sds = {WANDER: "wander", NOISE: "memory"}, self.sd_by_state
+        pairs = [(item, *item.split(" ", 1)) for item in self.uncertain]
+        return tuple(item for item, kind, name in pairs if kind == CONSTANT or sds[f"{name}.{suffix[kind]}"] > 0.0)
+
 
 class _NoiseFitter:
     """Fits the noise of a model to a training; arguments as for `find_uncertain`."""
 
     def __init__(self, model: ProcessModel, outputs: tuple[str, ...], rows: RowArrays) -> None:
-        self._model, self._outputs, self._rows = model, outputs, rows
+        self._model, self._outputs, self._rows, self._fits = model, outputs, rows, dict[tuple[str, ...], _Fit]()
 
     def fit(self, uncertain: tuple[str, ...]) -> _Fit:
-        """Fit the noise of the model with uncertain parts."""
+        """Fit the noise of the model with uncertain parts; each set of them once."""
+        if uncertain not in self._fits:
+            self._fits[uncertain] = self._new_fit(uncertain)
+        return self._fits[uncertain]
+
+    def _new_fit(self, uncertain: tuple[str, ...]) -> _Fit:
         model, smallest = self._model, [max(resolution_sd(column), 1e-6) for column in self._rows.outputs.T]
         found = fit_training_noise(model, self._outputs, self._rows, smallest, uncertain)
         return _Fit(uncertain, found, Filter(widen_model(model, uncertain), found.levels, found.parameters))
@@ -340,7 +374,7 @@ class _NoiseFitter:
     def loss_with(self, item: _Fit, added: tuple[str, ...]) -> float:
         """Smallest loss with disturbances of several sizes added to a fit, its noise levels as they are."""
         model, levels = widen_model(self._model, (*item.uncertain, *added)), item.noise.levels
-        known = dict(zip(item.filter.model.state_names, levels.process_sd, strict=True))
+        known = item.sd_by_state
         new = np.array([name not in known for name in model.state_names])
         scales = np.array([state.scale for state in model.states])
         before = np.array([known.get(name, 0.0) for name in model.state_names])
@@ -349,7 +383,8 @@ class _NoiseFitter:
             for share in (3.0, 1.0, 0.3, 0.1, 0.03, 0.01)
         ]
         smallest = [1e-9] * len(model.outputs)  # levels that were fitted keep the true bounds
-        times = first_times(self._model, (*item.uncertain, *added), self._rows) | dict(item.noise.parameters)
+        times = first_times(self._model, self._outputs, (*item.uncertain, *added), self._rows)
+        times |= item.noise.parameters
         return min(losses_nearby(model.with_values(times) if times else model, self._record, smallest, tried))
 
     def drop_disturbances(self, item: _Fit) -> bool:
@@ -359,7 +394,7 @@ class _NoiseFitter:
         if any(item.refused for item in screenings):
             return False
         usable = np.column_stack([item.usable for item in screenings]) | ~np.isfinite(run.residual[:, indices])
-        self._rows = self._rows._replace(outputs=np.where(usable, self._rows.outputs, nan))
+        self._rows, self._fits = self._rows._replace(outputs=np.where(usable, self._rows.outputs, nan)), {}
         return not usable.all()
 
     def filter(self, item: _Fit) -> FilterResult:

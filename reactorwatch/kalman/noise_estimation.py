@@ -33,7 +33,6 @@ from reactorwatch.codegen.compiled_function import LANES
 from reactorwatch.kalman.batch import GATE, FilterRecord, FilterResult, run_together
 from reactorwatch.kalman.ekf import Filter
 from reactorwatch.kalman.ekf_step import NoiseLevels
-from reactorwatch.kalman.filter_states import NOISE, WANDER, widen_model
 from reactorwatch.process.model import ProcessModel
 
 INITIAL_SHARES = (0.3, 0.03, 0.003)
@@ -77,6 +76,7 @@ def fit_noise(
     first_sd: Mapping[str, float] | None = None,
     nearby: Sequence[NoiseLevels] = (),
     *,
+    apart: Sequence[NoiseLevels] = (),
     lacking: bool = False,
 ) -> NoiseFit:
     """Maximum-likelihood noise levels of a record, and positive parameters of the model.
@@ -89,11 +89,12 @@ def fit_noise(
         learned: names of the parameters; the search starts at their values.
         first_sd: initial process noise by name of a state, where it differs from the noise that moves all states alike.
         nearby: further starts of the search, at most three, used where they are likelier than the first rows' result.
+        apart: starts from the likeliest of which there is a search of its own, for another explanation of the record.
         lacking: whether the model may lack an effect that sets in later and then passes for process noise, so that the
             search also starts from noisier processes. Else a temporary disturbance is not learned as noise.
     """
     smallest = np.asarray(smallest_sd, dtype=float)
-    return _NoiseSearch(model, record, smallest, learned, first_sd or {}).run(nearby, lacking)
+    return _NoiseSearch(model, record, smallest, learned, first_sd or {}).run(nearby, apart, lacking)
 
 
 def losses_nearby(
@@ -105,33 +106,44 @@ def losses_nearby(
     return [trial.loss for trial in search.evaluate([search.with_noise(item) for item in levels])]
 
 
-def noise_starts(
-    model: ProcessModel, added: tuple[str, ...], measured: Array, smallest_sd: Sequence[float]
-) -> list[NoiseLevels]:
+class NoiseStarts(NamedTuple):
+    """Noise levels from which a search should start, too; arguments `nearby` and `apart` of `fit_noise`."""
+
+    nearby: list[NoiseLevels]
+    apart: list[NoiseLevels]
+
+
+def noise_starts(model: ProcessModel, measured: Array, smallest_sd: Sequence[float]) -> NoiseStarts:
     """Noise levels from which a search should start, too.
 
-    All noise is coloured noise, and inputs that wander are all that moves the states, where there are such.
+    All noise is coloured noise, and inputs that wander are all that moves the states, where the model has such.
 
     Args:
-        model: the model without what is added to it.
-        added: see `widen_model`.
+        model: the model with the states that `widen_model` has added.
         measured: measurements, shape (rows, n_y); NaN where missing.
         smallest_sd: lower bounds of the sensors' noise.
     """
-    names = [item.split(" ", 1) for item in added]
-    coloured = [name for kind, name in names if kind == NOISE]
-    wandering = {f"{name}.wander" for kind, name in names if kind == WANDER and name in model.input_names}
-    if not coloured and not wandering:
-        return []
-    sds = np.maximum([initial_sensor_sd(column) for column in measured.T], smallest_sd)
-    by_name = dict(zip(model.output_names, sds.tolist(), strict=True))
-    states = widen_model(model, added).states
-    driving = np.array([by_name.get(s.name.removesuffix(".memory"), 0.0) * s.name.endswith(".memory") for s in states])
-    moving = np.array([state.scale * (state.name in wandering) for state in states])
-    sensors = tuple(0.3 * sd if name in coloured else sd for name, sd in by_name.items())
-    # Third differences see little of coloured noise.
-    shares = ((2.0, 0.03), (6.0, 0.3), (20.0, 3.0))
-    return [NoiseLevels(sensors, tuple((noise * driving + wander * moving).tolist())) for noise, wander in shares]
+    sds = np.maximum([initial_sensor_sd(column) for column in measured.T], smallest_sd).tolist()
+    sensors, memory, rounding, wander = list(sds), *np.zeros((3, len(model.states)))
+    for index, state in enumerate(model.states):
+        name, kind = state.name.rpartition(".")[::2]
+        if kind == "memory" and name in model.output_names:
+            output = model.output_names.index(name)
+            coarse, sd = is_coarse(measured[:, output]), sds[output]
+            sensors[output] = (0.6 if coarse else 0.3) * sd
+            if coarse:
+                rounding[index] = 0.8 * sd * sqrt(2.0 / model.parameter(f"{state.name}_min").value)
+            else:  # third differences see little of coloured noise
+                memory[index] = 2.0 * sd
+        elif kind == "wander" and name in model.input_names:
+            wander[index] = state.scale * sqrt(2.0 / model.parameter(f"{state.name}_min").value)
+
+    def levels(of_states: Array) -> NoiseLevels:
+        return NoiseLevels(tuple(sensors), tuple(of_states.tolist()))
+
+    nearby = [levels(rounding + size * memory) for size in (1.0, 3.0, 10.0)] if memory.any() else []
+    shares = (0.03, 0.1, 0.3, 1.0) if wander.any() else (0.0,) if rounding.any() else ()
+    return NoiseStarts(nearby, [levels(rounding + memory + share * wander) for share in shares])
 
 
 class _NoiseSearch:
@@ -165,7 +177,7 @@ class _NoiseSearch:
         one = Filter(model, first)
         self._filters = [one, *(one.clone() for _ in range(LANES - 1))]
 
-    def run(self, nearby: Sequence[NoiseLevels], lacking: bool) -> NoiseFit:
+    def run(self, nearby: Sequence[NoiseLevels], apart: Sequence[NoiseLevels], lacking: bool) -> NoiseFit:
         """Best noise levels and parameter values."""
         best = self._climb(self._drop_outliers(self._start()))
         rows = self._full.time_min.size
@@ -175,6 +187,12 @@ class _NoiseSearch:
             starts += self._noisier_starts(best.theta) if lacking else []
             best = min(self.evaluate(starts[:LANES]), key=lambda trial: trial.loss)
             best = self._climb(self._drop_outliers(best))
+        if apart:  # only what these starts move is moved
+            tried = self.evaluate([self.with_noise(levels) for levels in apart])
+            other = min(tried, key=lambda trial: trial.loss)
+            silent = {self._n_y + k for k, index in enumerate(self._states) if not apart[0].process_sd[index]}
+            other = self._climb(other, [index for index in range(other.theta.size) if index not in silent])
+            best = min(best, other, key=lambda trial: trial.loss)
         climbed = best
         for index in self._of_states:
             theta = best.theta.copy()
@@ -217,11 +235,11 @@ class _NoiseSearch:
         self._record = FilterRecord(record.time_min, record.inputs, measured, GATE, uncertainty=record.uncertainty)
         return self.evaluate([best.theta])[0]
 
-    def _climb(self, best: _Trial) -> _Trial:
-        """Take scoring steps up to convergence."""
+    def _climb(self, best: _Trial, chosen: Sequence[int] | None = None) -> _Trial:
+        """Take scoring steps in the chosen components of theta, or all, up to convergence."""
         for _ in range(8):
             before = best.loss
-            best, predicted = self._step(best, range(best.theta.size))
+            best, predicted = self._step(best, range(best.theta.size) if chosen is None else chosen)
             gain = before - best.loss
             # A gain as predicted means that the loss is quadratic here, so the optimum is reached.
             if gain < 0.2 or abs(gain - predicted) < 0.1:  # of log likelihood
@@ -242,7 +260,7 @@ class _NoiseSearch:
             tried.append(trial)
         return min(tried, key=lambda trial: trial.loss)
 
-    def _step(self, best: _Trial, chosen: range) -> tuple[_Trial, float]:
+    def _step(self, best: _Trial, chosen: Sequence[int]) -> tuple[_Trial, float]:
         """Take a scoring step in the chosen components of theta; returns `best` if none is better.
 
         Also returns the predicted gain, -inf for a shortened step, which predicts nothing about what is beyond.
@@ -339,6 +357,19 @@ def resolution(values: Array) -> float:
     steps = np.diff(levels)
     steps = steps[steps > 1e-12 * np.max(np.abs(levels), initial=0.0)]  # less is a rounding error
     return float(steps.min()) if steps.size else 0.0
+
+
+def is_coarse(values: Array) -> bool:
+    """True if a signal's rounding errors have memory, as its noise is less than half its step.
+
+    The errors of a signal that is rounded to steps of q are white if noise of a standard deviation of q / 2 or more
+    is added to it before: the correlation left is less than exp(-pi^2) of their variance (Widrow & Kollar 2008,
+    Quantization noise). Noise and errors together then have q / sqrt(3), and third differences show it.
+
+    Args:
+        values: values of the signal, shape (n,); NaN where missing.
+    """
+    return initial_sensor_sd(values) < resolution(values) / sqrt(3.0)
 
 
 def resolution_sd(values: Array, stated: float | None = None) -> float:

@@ -60,7 +60,10 @@ def descend(
             break
         information, gradient = known
         scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
-        information, gradient = information / np.outer(scale, scale), gradient / scale
+        with np.errstate(over="ignore"):
+            information, gradient = information / np.outer(scale, scale), gradient / scale
+        if not np.all(np.isfinite(information)):  # a parameter without effect beside one with an enormous one
+            break
         before, promised = best, 0.0
         for _ in range(_TRIES):
             scaled = np.linalg.lstsq(information + damping * np.eye(scale.size), gradient, rcond=1e-12)[0]

@@ -6,7 +6,7 @@ import pytest
 from reactorwatch.arrays import Array
 from reactorwatch.kalman.batch import FilterRecord
 from reactorwatch.kalman.ekf_step import NoiseLevels
-from reactorwatch.kalman.noise_estimation import fit_noise
+from reactorwatch.kalman.noise_estimation import fit_noise, is_coarse
 from reactorwatch.process.library.cstr import cstr
 from tests.unit.kalman.plant import record_of
 
@@ -103,3 +103,16 @@ def test_an_output_that_is_never_measured_has_the_smallest_level_and_one_that_is
     measured[:, 0] = 0.0
     levels = fit_noise(cstr(), FilterRecord(time_min, inputs, measured), (0.0, 0.0)).levels
     assert np.all(np.isfinite([*levels.measurement_sd, *levels.process_sd]))
+
+
+@pytest.mark.parametrize(("noise", "expected"), [(0.1, True), (0.2, True), (0.6, False), (2.0, False)])
+def test_rounding_errors_have_memory_where_the_noise_is_less_than_half_a_step(noise: float, expected: bool) -> None:
+    """By simulation: the errors in rows next to each other are correlated, or are not."""
+    rng = np.random.default_rng(9)
+    exact = 3.0 * np.sin(np.arange(20_000.0) / 200.0) + noise * rng.standard_normal(20_000)
+    shown = np.round(exact)
+    error = shown - exact
+    correlation = float(np.mean(error[1:] * error[:-1]) / np.mean(error**2))
+    assert (correlation > 0.05) == expected
+    assert is_coarse(shown) == expected
+    assert not is_coarse(exact)
