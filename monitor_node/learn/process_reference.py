@@ -11,6 +11,7 @@ import msgspec
 import numpy as np
 
 from monitor_node.ingest.alignment import NO_INTERVAL, MeasuredRow, missing_in_intervals
+from monitor_node.learn.free_run import FreeRun, FreeRunMemory
 from monitor_node.learn.references import FilterReference, PlantEquations, Reference, RowFilter, RowPrediction
 from monitor_node.learn.training_rows import RowArrays
 from reactorwatch.arrays import Array
@@ -47,6 +48,7 @@ class ProcessMemory(Memory, tag="process"):
         held_rows: number of rows since then, which the filter did not use.
         reach: see `input_reach`, one an input.
         typical_sd: median standard deviation of each residual in the last `run`, in the outputs' units.
+        free_run: memory of the free run.
     """
 
     noise: NoiseLevels
@@ -58,6 +60,7 @@ class ProcessMemory(Memory, tag="process"):
     held_rows: int = 0
     reach: list[float] = msgspec.field(default_factory=list)
     typical_sd: list[float] = msgspec.field(default_factory=list)
+    free_run: FreeRunMemory = msgspec.field(default_factory=FreeRunMemory)
 
     def reference(
         self, equations: ProcessModel | None, outputs: tuple[str, ...], models: Reference
@@ -93,6 +96,7 @@ class ProcessReference(FilterReference):
         self.plant_noise = of_states if memory.alone is None else memory.alone
         self.model = model = widen_model(model, model.uncertain, memory.learned)
         self._filter, inputs = Filter(model, noise), len(model.inputs)
+        self._free_run = FreeRun(model, noise, memory.free_run)
         self._outputs, self._indices = outputs, output_indices(model, outputs)
         self._count = len(model.outputs)
         self._accept_all = len(outputs) == self._count and self._indices == list(range(self._count))
@@ -183,6 +187,7 @@ class ProcessReference(FilterReference):
         they were as before or as after, one of them plus or minus its largest pulse of one row in the training.
         """
         memory, time_min, changes = self._memory, row.time_ns / MINUTE_NS, list[tuple[float, tuple[float, ...]]]()
+        self.has_returned = self._free_run.is_away = False
         inputs, missing = row.inputs, row.interval.missing
         unknown = any(memory.guessed) + memory.held_rows + missing
         if all(map(isfinite, inputs)):
@@ -208,6 +213,10 @@ class ProcessReference(FilterReference):
             for i, value, is_accepted in zip(self._indices, row.values, accept, strict=True):
                 measured[i], accepted[i] = value, is_accepted
         step = self._filter.update(time_min, memory.last_inputs, measured, gate=GATE, accept=accepted, changes=changes)
+        if memory.free_run.state is None:
+            self._free_run.add(self._filter, time_min, memory.last_inputs)
+        elif (state := self._free_run.update(time_min, memory.last_inputs, measured)) is not None:
+            self._filter.state, self.has_returned = state, True
         if self._accept_all:
             return RowPrediction(step.prediction, step.sd)
         return RowPrediction([step.prediction[i] for i in self._indices], [step.sd[i] for i in self._indices])
@@ -219,6 +228,18 @@ class ProcessReference(FilterReference):
         return self._accept_all and known and state.inputs == memory.last_inputs
 
     @property
+    def is_away(self) -> bool:
+        """See `Reference`."""
+        return self._free_run.is_away
+
+    def set_learning(self, learning: bool) -> None:
+        """Follow the plant in either case; beside it runs what follows nothing while nothing may be learned."""
+        if not learning:
+            self._free_run.start()
+        else:
+            self._free_run.stop()
+
+    @property
     def numbers(self) -> tuple[Array, Array]:
         """Belief of the filter, and its variances: its own numbers, see `Filter`."""
         return self._filter.numbers
@@ -227,6 +248,7 @@ class ProcessReference(FilterReference):
         """Note a row that a kernel has filtered in `numbers`."""
         self._memory.last_inputs = inputs
         self._filter.accept_row(time_min, inputs)
+        self._free_run.add(self._filter, time_min, inputs)
 
     def _possible_changes(self, time_min: float, inputs: tuple[float, ...]) -> list[tuple[float, tuple[float, ...]]]:
         """Start of the time in which inputs are unknown, with each of their possible values.
@@ -261,6 +283,7 @@ class ProcessReference(FilterReference):
     def restart(self) -> None:
         """See `Reference`; what is known about the constants is kept."""
         self._filter.interrupt()
+        self._free_run.forget()
         self._memory.guessed, self._memory.held_rows = self._all_known, 0
 
     def run(self, rows: RowArrays) -> Array:

@@ -71,11 +71,13 @@ class Reference(ABC):
         kind: `equations`, `black-box` or `arx`, as published.
         is_identified: True if the identified models predict, which are then not updated beside it.
         obstacles: reasons why rows are not judged now, each with what it is about.
+        has_returned: True if the newest row ended a fault, and the reference goes on as if it had not followed it.
     """
 
     kind: ClassVar[str]
     is_identified: ClassVar[bool] = False
     obstacles: Mapping[str, str] = MappingProxyType({})
+    has_returned: bool = False
 
     @property
     @abstractmethod
@@ -104,6 +106,11 @@ class Reference(ABC):
 
     def set_learning(self, learning: bool) -> None:  # noqa: B027 # without memory of the plant there is nothing to do
         """Learn from the rows to come, or not: while nothing is wrong, or a fault would be learned as ordinary."""
+
+    @property
+    def is_away(self) -> bool:
+        """True if the newest row is not what the reference predicts without the rows since before the alarm."""
+        return False
 
     @property
     def errs(self) -> bool:

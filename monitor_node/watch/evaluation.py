@@ -280,7 +280,10 @@ class Evaluation:
 
     def find_away(self) -> list[bool]:
         """For each output, True if it was not yet back in the row before, while an alarm is active."""
-        return self.charts.away or self.nowhere
+        levels = self.charts.away
+        if levels is not None or self.reference is None:
+            return levels or self.nowhere
+        return [self.reference.is_away] * len(self.nowhere)
 
     def restart(self) -> None:
         """Judge the next row without those before it, as after a gap; charts and alarms keep their memory."""
@@ -291,6 +294,12 @@ class Evaluation:
         self.shift.restart()
         self.change.restart()
         self.signals.on_gap()
+
+    def restart_residuals(self) -> None:
+        """Judge the next row without the residuals before it, which were those of a fault that is over."""
+        for whitener in self.whiteners:
+            whitener.restart()
+        self.charts.restart()
 
     def restart_charts(self) -> None:
         """Forget the rows seen, in the charts too."""

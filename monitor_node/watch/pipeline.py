@@ -296,6 +296,8 @@ class PlantPipeline:
         changes += charts.update(row, e, quarantined, scales, away=away, points=self._points)
         if shift.is_active:
             changes += shift.update(row, tested, away=away, points=self._points)
+        if reference.has_returned:
+            evaluation.restart_residuals()
         if self._board.has_unexplained:
             changes += evaluation.change.update(row, points=self._points)
         self._end_row(row, changes, before, stuck)
