@@ -63,10 +63,11 @@ class ChartDesign:
         evaluated: for each output, True if it is evaluated.
         signals: signals of the charts of values.
         is_identified: True if identified models predict.
+        memory_shares: share of the training's residuals that charts with a memory take, shape (n,).
     """
 
     def __init__(self, config: MonitorConfig) -> None:
-        self._config, self.is_identified = config, False
+        self._config, self.is_identified, self.memory_shares = config, False, np.ones(1)
         self.names = list[str](dict.fromkeys(name for name, _ in alarm_names(config)))
         self.chosen: list[str] = []
         self.evaluated: list[bool] = []
@@ -106,6 +107,11 @@ class ChartDesign:
         return {keys.chart_name(name, ALL): why for name, why in obstacles.items()}
 
     @property
+    def alarms_of_each(self) -> dict[str, int]:
+        """Number of alarms of each of the chosen charts that chance can raise, by name."""
+        return {name: _count_alarms([name], sum(self.evaluated), len(self.signals)) for name in self.chosen}
+
+    @property
     def chance_alarms(self) -> int:
         """Number of alarms of the chosen charts that chance can raise."""
         return _count_alarms(self.chosen, sum(self.evaluated), len(self.signals))
@@ -118,12 +124,14 @@ class ChartDesign:
         names = tuple(self._config.signals[index] for index in indices[varies].tolist())
         return names, complete[:, varies]
 
-    def baseline(self, learned: list[Prewhitening], e: Array, arl0: float) -> Baseline:
-        """Baseline of charts of residuals; arguments as for `relative_rates`."""
+    def baselines(self, learned: list[Prewhitening], e: Array, arl0: float) -> dict[bool, Baseline]:
+        """Baseline of charts of residuals, by whether they have a memory; arguments as for `relative_rates`."""
         config = self._config
         p = false_alarm_budget.point_probability(arl0, config.raise_count, config.window)
-        sds = memory_sds(e, config.chart_settings["ewma_weight"], 0.0 if self.is_identified else 3.0)
-        return Baseline(tuple(learned), e, sds, arl0, p, config.chart_settings)
+        lasting = e * self.memory_shares[:, None]
+        sds = memory_sds(lasting, config.chart_settings["ewma_weight"], 0.0 if self.is_identified else 3.0)
+        taken = {False: e, True: lasting}
+        return {has: Baseline(tuple(learned), x, sds, arl0, p, config.chart_settings) for has, x in taken.items()}
 
     def value_baseline(self, values: Array, arl0: float) -> ValueBaseline:
         """Baseline of charts of values; arguments as for `relative_rates`."""
@@ -143,7 +151,7 @@ class ChartDesign:
             arl0: run length of each alarm without a fault, in rows.
             errors: errors of all outputs.
         """
-        baseline = self.baseline(learned, e, arl0)
+        baselines = self.baselines(learned, e, arl0)
         total = np.zeros(len(errors.mean))
         for name in self.chosen:
             kind = chart(name)
@@ -151,6 +159,7 @@ class ChartDesign:
                 total += kind.relative_rates(self.value_baseline(values, arl0))
                 continue
             assert issubclass(kind, SignalChart | JointChart)
+            baseline = baselines[kind.has_memory]
             for group in self._groups(kind):
                 rates = kind.relative_rates(baseline.of(group), errors.of(group))
                 total += rates if kind.has_memory else self._rule_rates(baseline, rates)
@@ -158,11 +167,11 @@ class ChartDesign:
 
     def detectors(self, learned: list[Prewhitening], e: Array, arl0: float) -> list[Detector]:
         """The charts as moving averages, as far as they are; arguments as for `relative_rates`."""
-        baseline, found = self.baseline(learned, e, arl0), []
+        baselines, found = self.baselines(learned, e, arl0), list[Detector]()
         for name in self.chosen:
             kind = chart(name)
             for group in self._groups(kind):
-                average = kind.detector(baseline.of(group))
+                average = kind.detector(baselines[kind.has_memory].of(group))
                 if average is not None:
                     weight, level, matrix = average
                     rule = (1, 1) if kind.has_memory else (self._config.raise_count, self._config.window)

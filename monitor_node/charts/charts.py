@@ -62,6 +62,7 @@ class _ChartRow(NamedTuple):
 
     Attributes:
         e: prewhitened residual of each output; NaN where there is none.
+        lasting: the same as charts with a memory take it, see `RowPrediction.memory_share`.
         known: for each output, True if it has one.
         withheld: outputs whose value may be an outlier and must not enter a memory yet.
         inputs: one value an input; NaN where missing.
@@ -69,10 +70,15 @@ class _ChartRow(NamedTuple):
     """
 
     e: list[float]
+    lasting: list[float]
     known: list[bool]
     withheld: tuple[bool, ...]
     inputs: Sequence[float]
     values: Sequence[float]
+
+    def residuals(self, kind: type[Chart]) -> list[float]:
+        """Residuals that charts of a kind take."""
+        return self.lasting if kind.has_memory else self.e
 
     def present(self, kind: type[Chart]) -> list[bool]:
         """For each output, True if charts of a kind take its residual."""
@@ -124,7 +130,7 @@ class _Banked(_Charts):
         self._bank = bank
 
     def update(self, row: _ChartRow, *, always: bool) -> _Judgements:
-        return self._bank.judge(row.e, row.present(self._bank.kind), always=always)
+        return self._bank.judge(row.residuals(kind := self._bank.kind), row.present(kind), always=always)
 
     def restart(self, index: int) -> None:
         self._bank.restart(index)
@@ -141,10 +147,9 @@ class _OfEach(_Charts):
         self._charts = charts
 
     def update(self, row: _ChartRow, *, always: bool) -> _Judgements:
-        present = row.present(type(self._charts[0]))
-        judgements = [
-            item.update(value) if here else None for item, value, here in zip(self._charts, row.e, present, strict=True)
-        ]
+        kind = type(self._charts[0])
+        taken = zip(self._charts, row.residuals(kind), row.present(kind), strict=True)
+        judgements = [item.update(value) if here else None for item, value, here in taken]
         return judgements if always or any(item is not None and item.out for item in judgements) else None
 
     def restart(self, index: int) -> None:
@@ -183,7 +188,7 @@ class _OfAll(_Single[JointChart]):
         """Update with a row; a row with a missing output is skipped."""
         if True in row.withheld or False in compress(row.known, self._evaluated):
             return None
-        self._last = list(compress(row.e, self._evaluated))
+        self._last = list(compress(row.residuals(type(self._chart)), self._evaluated))
         return self._judge(self._last, always=always)
 
     def is_held(self, index: int, away: list[bool]) -> bool:
@@ -302,12 +307,13 @@ class ChartWatch:
             values: measured values of the training, see `ChartDesign.choose`.
             arl0: run length of each alarm without a fault, in rows.
         """
-        design, baseline = self.design, self.design.baseline(learned, e, arl0)
-        p = baseline.point_probability
+        design, baselines = self.design, self.design.baselines(learned, e, arl0)
+        p = baselines[False].point_probability
         widths, passed = [designed_width(p, item) for item in learned], [item.shift_gain for item in learned]
         self.memory = ChartsMemory({}, widths, passed)
 
         def design_charts(kind: type[Chart]) -> _Made:
+            baseline = baselines[kind.has_memory]
             if issubclass(kind, CompiledChart):
                 return Bank.of([kind.design(baseline.of([index])) for index in range(len(learned))])
             if issubclass(kind, SignalChart):
@@ -329,10 +335,7 @@ class ChartWatch:
         self.memory = memory
         design.evaluated, design.chosen = evaluated, [name for name in names if name in stored]
         outputs = len(self._config.outputs)
-        each = {name for name in names if issubclass(chart(name), SignalChart)}
-        if self._config.has_values_only and not each & set(stored):
-            each = set()
-        if not each <= set(stored) <= set(names) or not len(memory.widths) == len(memory.passed) == outputs:
+        if not set(stored) <= set(names) or not len(memory.widths) == len(memory.passed) == outputs:
             raise ValueError(f"there must be the charts {', '.join(names)}, got {', '.join(stored)}")
 
         def resume_charts(kind: type[Chart]) -> _Made:
@@ -380,6 +383,7 @@ class ChartWatch:
         self,
         row: MeasuredRow,
         e: list[float],
+        memory_share: float,
         withheld: tuple[bool, ...],
         scales: list[float],
         *,
@@ -391,13 +395,15 @@ class ChartWatch:
         Args:
             row: the row; points are added to its publications.
             e: prewhitened residuals; NaN where there is none.
+            memory_share: share of them that charts with a memory take.
             withheld: outputs whose value may be an outlier and must not enter a memory yet.
             scales: one standard deviation of each, in the outputs' units.
             away: for each output, True if it is not back.
             points: True to publish the charts' points.
         """
         known = [size == size for size in e]  # NaN is not equal to itself
-        seen, changes = _ChartRow(e, known, withheld, row.inputs, row.values), list[AlarmChange]()
+        lasting = e if memory_share == 1.0 else [memory_share * value for value in e]
+        seen, changes = _ChartRow(e, lasting, known, withheld, row.inputs, row.values), list[AlarmChange]()
         for charts in self._watched.values():
             always = points or any(alarm.memory.standing or alarm.memory.recent for alarm in charts.alarms)
             for index, judgement in enumerate(charts.update(seen, always=always) or ()):

@@ -12,7 +12,8 @@ residual is beyond `GATE` standard deviations, and not while an alarm is active.
 and the training counts as at least so many: a model that learned faster would learn a fault before the charts see it.
 What it learned shortly before an alarm is taken back: its state becomes that of a copy that is `COPY_ROWS` to twice as
 many rows old. The variance of a residual grows with the leverage of its row, by which the parameters are uncertain, and
-more where the errors of held-out rows of the training do.
+more where the errors of held-out rows of the training do; and with the distance of the inputs from those of the
+training, by which errors last (`spc.extrapolation`).
 
 Where the rows of many signals need predictions for the signal checks only, the models judge as fitted, and one product
 of matrices predicts all outputs: a call for each output would cost more than all else.
@@ -40,6 +41,7 @@ from reactorwatch.kalman.batch import GATE
 from reactorwatch.process.model import ProcessModel
 from reactorwatch.spc.charts.base import Judgement
 from reactorwatch.spc.charts.parameters import ParameterT2
+from reactorwatch.spc.extrapolation import WEIGHT, Extrapolation
 from reactorwatch.stored_state import Memory, copy_of
 
 MEMORY = 2_000
@@ -202,8 +204,15 @@ class ArxPredictor(Memory, dict=True):
         first = self.structure.output_lags
         return slice(first, first + self.structure.input_lags * self.structure.inputs)
 
-    def update(self, inputs: Sequence[float], value: float, *, follows: bool) -> float:
-        """Update with a row; returns the prediction made before it, NaN if there is none."""
+    def update(self, inputs: Sequence[float], value: float, *, follows: bool, extrapolation_sd: float = 1.0) -> float:
+        """Update with a row; returns the prediction made before it, NaN if there is none.
+
+        Args:
+            inputs: one value an input; NaN where missing.
+            value: the output; NaN if missing.
+            follows: True if the row follows the one before.
+            extrapolation_sd: standard deviation of the residual by the distance of the inputs from the training.
+        """
         if self.scaling is None:
             self._learn_scaling(inputs, value)
             return nan
@@ -217,7 +226,7 @@ class ArxPredictor(Memory, dict=True):
             self.sd = self.extrapolation_sd = 1.0
             return nan
         if self.copies:
-            prediction = self._learn_carefully(regressor, scaled)
+            prediction = self._learn_carefully(regressor, scaled, extrapolation_sd)
             self.extrapolation_sd = self._extrapolation_sd(regressor)
         else:
             prediction = self.rls.update(regressor, scaled).prediction
@@ -261,10 +270,11 @@ class ArxPredictor(Memory, dict=True):
             self.rls = RecursiveLeastSquares.resume(copy_of(self.copies[0]))
         self.copies, self.copied_rows = [copy_of(self.rls.memory)] * 2, 0
 
-    def _learn_carefully(self, regressor: Array, scaled: float) -> float:
+    def _learn_carefully(self, regressor: Array, scaled: float, extrapolation_sd: float) -> float:
         """Learn from a row where nothing is wrong; returns the prediction before."""
         prediction = self.rls.predict(regressor)
-        self.sd = min(sqrt(1.0 + self.leverage_gain * self.rls.leverage(regressor)), self.largest_sd)
+        by_leverage = min(sqrt(1.0 + self.leverage_gain * self.rls.leverage(regressor)), self.largest_sd)
+        self.sd = by_leverage * extrapolation_sd
         if self.learning and (scaled - prediction) ** 2 <= (GATE * self.sd) ** 2 * self.rls.noise_variance:
             self.rls.update(regressor, scaled)
             self.copied_rows += 1
@@ -305,11 +315,15 @@ class ArxMemory(Memory, tag="arx"):
         high: upper end of it.
         past: where the models stay as fitted, signals of the rows before the next one, the inputs first and the newest
             row first, shape (rows, signals), NaN where missing; None elsewhere.
+        extrapolation: variance of residuals by the distance of the inputs from the training; None: it does not grow.
+        averages: averaged inputs, shape (inputs,).
     """
 
     low: list[float] = msgspec.field(default_factory=list)
     high: list[float] = msgspec.field(default_factory=list)
     past: Array | None = None
+    extrapolation: Extrapolation | None = None
+    averages: Array | None = None
 
     def reference(
         self, equations: ProcessModel | None, outputs: tuple[str, ...], models: "ArxReference"
@@ -372,7 +386,7 @@ class ArxReference(Reference):
         shape = self.history, len(self.config.signals)
         if memory.past is not None and memory.past.shape != shape:
             raise ValueError(f"rows before must have shape {shape}, got {memory.past.shape}")
-        self._memory, self.obstacles = memory, {}
+        self._memory, self.obstacles, self._lasting_sds = memory, {}, (1.0, 1.0)
         self._uses_inputs = np.array([predictor.structure.inputs > 0 for predictor in self.predictors])
         self._ranges = list(enumerate(zip(memory.low, memory.high, strict=True))) if self._uses_inputs.any() else []
         if memory.past is not None:
@@ -407,11 +421,23 @@ class ArxReference(Reference):
         return found if self.points else []
 
     def _update_adaptive(self, row: MeasuredRow) -> list[float]:
-        pairs = zip(self.predictors, row.values, strict=True)
-        return [predictor.update(row.inputs, value, follows=row.follows) for predictor, value in pairs]
+        pairs, (sd, _) = zip(self.predictors, row.values, strict=True), self._lasting_sds
+        return [
+            predictor.update(row.inputs, value, follows=row.follows, extrapolation_sd=sd) for predictor, value in pairs
+        ]
+
+    def _average_inputs(self, inputs: tuple[float, ...]) -> None:
+        """Average the inputs of a row into those before."""
+        extrapolation, averages = self._memory.extrapolation, self._memory.averages
+        if extrapolation is None or averages is None:
+            return
+        new = np.array(inputs)
+        self._memory.averages = averages = averages + WEIGHT * np.where(np.isfinite(new), new - averages, 0.0)
+        self._lasting_sds = extrapolation.sds(averages)
 
     def update(self, row: MeasuredRow, accept: tuple[bool, ...]) -> RowPrediction:
         """See `Reference`. Predictions with an input beyond the training are extrapolations."""
+        self._average_inputs(row.inputs)
         predictions = self._predict_by_matrix(row) if self.stays_as_fitted else self._update_adaptive(row)
         extrapolation = predictions, [predictor.extrapolation_sd for predictor in self.predictors]
         outside = (i for i, (low, high) in self._ranges if row.inputs[i] < low or row.inputs[i] > high)
@@ -419,7 +445,8 @@ class ArxReference(Reference):
         text = "is beyond its range in the training: the identified model does not hold there"
         self.obstacles = {name: f"rows are not judged while {name} {text}" for name in beyond}
         judged = np.where(self._uses_inputs, nan, predictions).tolist() if beyond else predictions
-        return RowPrediction(judged, [predictor.sd for predictor in self.predictors], extrapolation)
+        share = self._lasting_sds[0] / self._lasting_sds[1]
+        return RowPrediction(judged, [predictor.sd for predictor in self.predictors], extrapolation, share)
 
     def restart(self) -> None:
         """See `Reference`; what the models have learned stays."""

@@ -24,6 +24,7 @@ from reactorwatch.identification.linear import fit_linear
 from reactorwatch.identification.linear_model import standard_deviations
 from reactorwatch.identification.structure import Structure
 from reactorwatch.spc.charts.parameters import learn
+from reactorwatch.spc.extrapolation import FittedExtrapolation
 
 ROWS_A_PARAMETER = 10
 """Least number of rows per parameter of a fitted model."""
@@ -226,8 +227,14 @@ def _residual_check(test: ResidualTest) -> Check:
     return Check(name=test.name, result="ok" if test.minus_log10_p < WORST_MINUS_LOG10_P else left_out)
 
 
-def start_judging(models: ArxReference, rows: RowArrays) -> None:
-    """Judge the rows after a training by the models; each input must have values."""
+def start_judging(models: ArxReference, rows: RowArrays, fitted: FittedExtrapolation | None = None) -> None:
+    """Judge the rows after a training by the models; each input must have values.
+
+    Args:
+        models: the models.
+        rows: rows of the training.
+        fitted: variance of the residuals by the distance of the inputs; None: it does not grow.
+    """
     time_min, inputs, outputs = rows
     low, high = np.nanmin(inputs, axis=0), np.nanmax(inputs, axis=0)
     margin = 0.1 * (high - low)
@@ -246,6 +253,8 @@ def start_judging(models: ArxReference, rows: RowArrays) -> None:
     else:
         for predictor in models.predictors:
             predictor.start_judging()
+        if fitted is not None:
+            memory.extrapolation, memory.averages = fitted.extrapolation, fitted.averages
     models.judge_by(memory)
 
 

@@ -94,6 +94,8 @@ class BlackBoxReference(FilterReference):
 
     Attributes:
         model: the fitted state map.
+        held_out: errors in rows of the training that were held out, shape (n, outputs), NaN where there is none; of no
+            row where it was not just learned.
     """
 
     kind = "black-box"
@@ -104,6 +106,7 @@ class BlackBoxReference(FilterReference):
         memory.filter = self._filter.memory
         if memory.error_scale:
             self._filter.constants[RATE] = 0.0
+        self.held_out = np.empty((0, memory.count))
         self._outputs, self._count, self.period_min = memory.outputs, memory.count, memory.period_min
         if memory.unfamiliar_rows:
             self.obstacles = UNFAMILIAR
@@ -165,8 +168,8 @@ class BlackBoxReference(FilterReference):
             if np.isfinite(column).any():
                 reference.typical_sd[output] = float(np.nanmedian(column))
         reference._memory.time_min, reference._memory.last_inputs = float(time_min[-1]), tuple(inputs[-1].tolist())
-        z = np.full(measured.shape, nan)
-        z[:, outputs] = residuals / sds * model.out_of_sample
+        z, reference.held_out = np.full(measured.shape, nan), np.full(measured.shape, nan)
+        z[:, outputs], reference.held_out[:, outputs] = residuals / sds * model.out_of_sample, held_out * held_out_sds
         return reference, z
 
     @property

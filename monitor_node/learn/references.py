@@ -29,11 +29,14 @@ class RowPrediction(NamedTuple):
         sd: standard deviations of the residuals in the same units; 1 if unknown.
         extrapolation: for tests that need every row, predictions with their standard deviations that include those
             where the reference knows too little of the point of operation for charts; None: they are the same.
+        memory_share: share of a residual that charts with a memory take, at most 1: what is not known of the plant at a
+            point of operation lasts, and they would add it up.
     """
 
     prediction: Sequence[float]
     sd: Sequence[float]
     extrapolation: tuple[Sequence[float], Sequence[float]] | None = None
+    memory_share: float = 1.0
 
 
 class RowFilter(NamedTuple):

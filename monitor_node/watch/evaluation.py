@@ -4,7 +4,7 @@ They are reference, prewhitening, signal checks, charts, tests of lasting steps,
 way of a row through them is the pipeline's (`pipeline`).
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from typing import Any
 
 import msgspec
@@ -178,21 +178,32 @@ class Evaluation:
 
     # --- start and stop --------------------------------------------------------------------------------------
 
-    def start(self, trained: TrainingResult, period_ns: float, *, again: bool) -> None:
-        """Start to evaluate rows, or `again` by another model: the drift of the identified models then goes on."""
+    def start(self, trained: TrainingResult, period_ns: float, *, again: bool, excessive: Collection[str] = ()) -> None:
+        """Start to evaluate rows, or `again` by another model: the drift of the identified models then goes on.
+
+        Args:
+            trained: result of the training.
+            period_ns: sampling period.
+            again: see above.
+            excessive: charts that break the promise in the training, and are left out.
+        """
         self._leave_out(trained.left_out)
-        self.charts.design.is_identified = trained.reference.is_identified
-        unmade = self.charts.design.choose(
+        design, checks = self.charts.design, list(trained.checks)
+        design.is_identified = trained.reference.is_identified
+        design.memory_shares = np.ones(1) if trained.extrapolation is None else trained.extrapolation.memory_shares
+        unmade = design.choose(
             self.evaluated, trained.e, trained.values, has_equations=trained.reference.follows_equations
         )
-        self.shift.is_active = trained.responses is not None and not self._config.has_values_only
-        trained.checks.extend(
-            Check(name="charts", result=f"{alarm} is left out: {why}") for alarm, why in unmade.items()
+        design.chosen = [name for name in design.chosen if name not in excessive]
+        unmade |= dict.fromkeys(
+            excessive, "in the second half of the training it broke the promise; the others have its false alarms"
         )
+        self.shift.is_active = trained.responses is not None and not self._config.has_values_only
+        checks += [Check(name="charts", result=f"{alarm} is left out: {why}") for alarm, why in unmade.items()]
         period_min = period_ns / MINUTE_NS
-        arl0 = self._share_budget(period_min, trained.checks)
+        arl0 = self._share_budget(period_min, checks)
         memory, trained = self.memory, self._widen(trained, arl0)
-        memory.checks, memory.arl0 = trained.checks, arl0
+        memory.checks, memory.arl0 = checks, arl0
         self._set_reference(trained.reference, trained.learned)
         for whitener, item in zip(self.whiteners, trained.learned, strict=True):
             whitener.start(item)
@@ -207,7 +218,8 @@ class Evaluation:
         memory.promise = self.promises.promise
         if not again:
             self.notes += self.drift.start(self.models.predictors, self.evaluated, arl0)
-        self.notes += [f"training: {check.result}" for check in trained.checks if check.result != "ok"]
+        told = [f"training: {check.result}" for check in checks if check.result != "ok"]
+        self.notes += [note for note in told if note not in self.notes]
 
     def _widen(self, trained: TrainingResult, arl0: float) -> TrainingResult:
         """Training with wider limits, where the reference errs.
@@ -225,8 +237,13 @@ class Evaluation:
     def check_training(
         self, trained: TrainingResult, model: ProcessModel | None, period_ns: float, units: Sequence[str]
     ) -> None:
-        """Judge the training by itself, and state the power of the watch that has started with it."""
-        watch: Watch | None = None
+        """Judge the training by itself, and state the power of the watch that has started with it.
+
+        Charts that break the promise in it are left out.
+        """
+        check, watch = self.promises.check(trained, model), None
+        if check.excessive:
+            self.start(trained, period_ns, again=True, excessive=check.excessive)
         trained = self._widen(trained, self.memory.arl0)
         if self.promises.states_power:
             watch = Watch(
@@ -236,11 +253,12 @@ class Evaluation:
                 self.charts.design.detectors(trained.learned, trained.e, self.memory.arl0),
                 self.charts.design.level_reaches(trained.values, self.memory.arl0),
                 self.shift.sensitivities,
+                (1.0,) if trained.extrapolation is None else trained.extrapolation.usual_sds,
                 self.evaluated,
                 dict(zip(self._config.outputs, units, strict=True)),
                 period_ns / MINUTE_NS,
             )
-        note = self.promises.check(trained, model, watch, self.memory.rows_watched)
+        note = self.promises.conclude(check, watch, trained.rows, self.memory.rows_watched)
         self.notes += [note] if note else []
 
     def _set_reference(
@@ -279,7 +297,7 @@ class Evaluation:
         self._leave_out({})
 
     def find_away(self) -> list[bool]:
-        """For each output, True if it was not yet back in the row before, while an alarm is active."""
+        """For each output, True if it is not yet back: by its level up to the row before, or else by the reference."""
         levels = self.charts.away
         if levels is not None or self.reference is None:
             return levels or self.nowhere

@@ -273,7 +273,7 @@ class PlantPipeline:
         values = row.values
         if row.interval.is_gap:  # the input in it is unknown
             evaluation.restart()
-        predictions, sds, extrapolation = reference.update(row, memory.quarantined)
+        predictions, sds, extrapolation, memory_share = reference.update(row, memory.quarantined)
         z = [(value - prediction) / sd for value, prediction, sd in zip(values, predictions, sds, strict=True)]
         tested = z
         if extrapolation is not None:
@@ -293,7 +293,7 @@ class PlantPipeline:
                 if outlier:
                     whitener.reject_last()
         away = evaluation.find_away() if self._board.has_unexplained else evaluation.nowhere
-        changes += charts.update(row, e, quarantined, scales, away=away, points=self._points)
+        changes += charts.update(row, e, memory_share, quarantined, scales, away=away, points=self._points)
         if shift.is_active:
             changes += shift.update(row, tested, away=away, points=self._points)
         if reference.has_returned:

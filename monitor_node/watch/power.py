@@ -69,6 +69,7 @@ class Watch(NamedTuple):
         level_reaches: by output, the bias that the chart of levels sees in the long run, in its unit.
         steps: statistic of each output's test of lasting steps after a step of one unit, and its limit; empty without
             tests.
+        residual_sds: standard deviations of residuals at equally likely distances of the inputs from the training.
         evaluated: for each output, True if it is evaluated.
         units: units by output.
         period_min: sampling period.
@@ -80,6 +81,7 @@ class Watch(NamedTuple):
     detectors: Sequence[Detector]
     level_reaches: dict[str, float]
     steps: Sequence[tuple[float, float]]
+    residual_sds: Sequence[float]
     evaluated: Sequence[bool]
     units: dict[str, str]
     period_min: float
@@ -126,7 +128,7 @@ def _add_step_tests(watch: Watch, names: Sequence[str], paths: Array) -> tuple[A
     statistics = np.zeros((*paths.shape[:3], len(watch.steps)))
     for index, (name, (statistic, _)) in enumerate(zip(outputs, watch.steps, strict=False)):
         if f"{name}.bias" in names:
-            statistics[names.index(f"{name}.bias"), :, 0, index] = statistic
+            statistics[names.index(f"{name}.bias"), :, 0, index] = statistic / np.array(watch.residual_sds)
     tests = [
         Detector((len(outputs) + index,), np.eye(1), 1.0, limit)
         for index, (_, limit) in enumerate(watch.steps)
@@ -197,6 +199,7 @@ def _biases(watch: Watch, arrays: RowArrays) -> list[Deviation]:
         paths = np.zeros((1, rows, len(watch.config.outputs)))
         if responses is not None:
             paths[0, :, index] = np.nan_to_num(responses[index])
+            paths = np.concatenate([paths / sd for sd in watch.residual_sds])
         if usual is not None:
             size, runs = reference.typical_sd[index], []
             for onset in onsets:

@@ -7,8 +7,7 @@ twice: the second half of the training is judged by the first (`promise_check`),
 plant is watched are compared with those promised.
 """
 
-from collections.abc import Callable
-from math import log
+from collections.abc import Callable, Sequence
 from typing import TypeAlias
 
 import msgspec
@@ -35,6 +34,9 @@ from reactorwatch.sentences.promise import describe_broken_promise, describe_pro
 from reactorwatch.spc import false_alarm_budget
 from reactorwatch.spc.false_alarm_budget import QUANTILE
 from reactorwatch.stored_state import Memory, Storable
+
+EVENT_ROWS = 20
+"""Rows after an alarm in which another one is of the same event: twice the memory of an average of the usual weight."""
 
 UNLIKELY = 0.003
 """Probability of so many alarms by chance below which the promise is not kept."""
@@ -74,12 +76,14 @@ class TrainingCheck(Storable, msgspec.Struct, frozen=True, forbid_unknown_fields
         found: number of alarms, with limits for the promised rate.
         expected: number promised.
         excess: times as many false alarms as promised that the plant has by this check; 0: no more than promised.
+        excessive: charts that break the promise, and are left out for that.
     """
 
     rows: int = 0
     found: int = 0
     expected: float = 0.0
     excess: float = 0.0
+    excessive: tuple[str, ...] = ()
 
 
 class PlantPromise(Memory):
@@ -108,7 +112,7 @@ class PlantPromise(Memory):
     def count_alarms(self, count: int, row: int) -> tuple[bool, bool]:
         """Count alarms that chance can raise; returns whether the plant had drifted before, and has now."""
         had_drifted = self.has_drifted(row)
-        self.events += not self.found or row - self.last_row > 20
+        self.events += not self.found or row - self.last_row > EVENT_ROWS
         self.found, self.last_row = self.found + count, row
         return had_drifted, self.has_drifted(row)
 
@@ -168,23 +172,26 @@ def probability_of(found: int, expected: Array) -> float:
     return float(np.mean(pdtrc(found - 1, expected))) if found else 1.0
 
 
-def extrapolate_count(found: int, arl0: float, opportunities: float, wanted_arl0: float) -> float:
-    """False alarms in as many opportunities with other limits, from those with limits for one run length.
+def excess_by_events(events: Sequence[int], arl0: Sequence[float], opportunities: float) -> float:
+    """Times as many false alarms as promised, by the events that came with limits for several run lengths.
 
     Residuals larger than in the training by a factor have the logarithms of their run lengths divided by its square,
-    because tails fall as exp(-L^2 / 2): a run length A that was intended becomes A^g, with g from the alarms found.
+    because tails fall as exp(-L^2 / 2): a run length A that was intended becomes A^g. The likeliest g for Poisson
+    counts with all limits together holds for the first of them: with its own alone, one bad point of operation in a
+    few hundred rows would stand for a rate.
 
-    >>> round(extrapolate_count(3, 1500.0, 4500.0, 1e6), 4)  # as many as intended
-    0.0045
+    >>> round(excess_by_events([0, 3], [1e6, 1500.0], 4500.0), 1)  # as many as intended
+    1.0
 
     Args:
-        found: number of alarms, at least 1.
-        arl0: run length for which the limits were.
+        events: number of separate events with each of the limits.
+        arl0: run length for which these limits were.
         opportunities: rows times alarms.
-        wanted_arl0: run length of the other limits.
     """
-    exponent = min(max(log(opportunities / found), 0.0) / log(arl0), 1.0)
-    return float(opportunities / wanted_arl0**exponent)
+    g = np.linspace(0.02, 1.0, 99)
+    expected = opportunities / np.array(arl0)[:, None] ** g
+    fits = np.sum(np.array(events)[:, None] * np.log(expected) - expected, axis=0)
+    return float(arl0[0] ** (1.0 - g[np.argmax(fits)]))
 
 
 RAISED = Event.RAISED.value
@@ -239,27 +246,31 @@ class PromiseStage:
         counts = (0, 0, 0) if before is None else (before.found, before.events, before.last_row)
         self.promise = PlantPromise(mean, max(mean, upper), rows, check, *counts)
 
-    def check(self, trained: TrainingResult, model: ProcessModel | None, watch: Watch | None, rows_watched: int) -> str:
-        """Judge the training by itself, and state the power; an error there leaves the promise without them.
+    def check(self, trained: TrainingResult, model: ProcessModel | None) -> TrainingCheck:
+        """Judge the training by itself; an error there leaves the promise without it."""
+        if self.promise is None or self._check is None:
+            return TrainingCheck()
+        try:
+            return self._check(self._config, model, trained.rows, trained.reference.kind)
+        except Exception as error:  # noqa: BLE001 # the stage's border: alarms are right without it
+            self._failures.add("promise", error, "the promise of false alarms is not checked by the training")
+            return TrainingCheck()
+
+    def conclude(self, check: TrainingCheck, watch: Watch | None, rows: TrainingRows, rows_watched: int) -> str:
+        """Take over a check, and state the power; an error there leaves the promise without it.
 
         Returns:
             A note if the promise is not kept, else empty.
         """
         if self.promise is None:
             return ""
+        self.promise.check = replace(check, excess=max(check.excess, self.promise.check.excess))
+        self._board.warning = self.promise.warning
         if watch is not None:
             try:
-                self.promise.power = Promise(power=state_power(watch, trained.rows)).SerializeToString()
+                self.promise.power = Promise(power=state_power(watch, rows)).SerializeToString()
             except Exception as error:  # noqa: BLE001 # the stage's border: alarms are right without it
                 self._failures.add("power", error, "the deviations that would be seen are not stated")
-        if self._check is not None:
-            try:
-                check = self._check(self._config, model, trained.rows, trained.reference.kind)
-            except Exception as error:  # noqa: BLE001 # the stage's border: alarms are right without it
-                self._failures.add("promise", error, "the promise of false alarms is not checked by the training")
-            else:
-                self.promise.check = replace(check, excess=max(check.excess, self.promise.check.excess))
-                self._board.warning = self.promise.warning
         return "" if self.promise.is_kept else self._note(rows_watched)
 
     def messages(self, time_ns: int, rows: int) -> list[Publication]:

@@ -2,11 +2,15 @@
 
 Twice: with limits for the promised rate, at which a few hundred rows hardly ever have an alarm, and with limits at
 which some are expected. Many more than those show that residuals are larger than the training said; how often the
-tighter limits are then crossed follows (`extrapolate_count`). The uncertainty of limits from half the rows is allowed
-for.
+tighter limits are then crossed follows from both (`excess_by_events`). The uncertainty of limits from half the rows is
+allowed for.
+
+Where the events are those of some charts, and the others have no more than chance explains, these charts break the
+promise: they are left out, and the others have their share of the false alarms.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
 import msgspec
@@ -17,15 +21,20 @@ from monitor_node.ingest.alignment import Row
 from monitor_node.learn.training_rows import TrainingRows
 from monitor_node.watch.pipeline import PlantPipeline
 from monitor_node.watch.promise import (
+    EVENT_ROWS,
+    RAISED,
     UNLIKELY,
     PlantPromise,
     TrainingCheck,
-    extrapolate_count,
+    excess_by_events,
     probability_of,
 )
 from reactorwatch.arrays import Array
+from reactorwatch.contract.codec import Publication
+from reactorwatch.contract.messages_pb2 import Alarm
 from reactorwatch.errors import InputError
 from reactorwatch.process.model import ProcessModel
+from reactorwatch.spc.charts.level import Level
 from reactorwatch.stored_state import copy_of
 
 
@@ -37,12 +46,16 @@ class _Trial(NamedTuple):
         rows: number of rows judged.
         rates: false alarms a row by the errors that the first half may have made, shape (draws,).
         opportunities: rows times alarms that chance can raise.
+        shares: share of each chart in these alarms, by name.
+        raised: row and chart, or check, of each alarm.
     """
 
     promise: PlantPromise
     rows: int
     rates: Array
     opportunities: float
+    shares: dict[str, float]
+    raised: list[tuple[int, str]]
 
     @property
     def mean_count(self) -> float:
@@ -54,10 +67,28 @@ class _Trial(NamedTuple):
         """True if chance hardly explains so many alarms."""
         return probability_of(self.promise.events, self.rates * self.rows) < UNLIKELY
 
-    def count_at(self, arl0: float) -> float:
-        """Number of alarms with limits for a run length."""
-        found, own_arl0 = self.promise.found, self.opportunities / self.mean_count
-        return extrapolate_count(found, own_arl0, self.opportunities, arl0)
+    @property
+    def excessive(self) -> dict[str, int]:
+        """Number of events of each chart for which chance hardly explains so many."""
+        counts = {name: self._count_events({name}) for name in self.shares}
+        expected = {name: self.rates * self.rows * share for name, share in self.shares.items()}
+        return {name: count for name, count in counts.items() if probability_of(count, expected[name]) < UNLIKELY}
+
+    def holds_without(self, charts: Collection[str]) -> bool:
+        """True if chance explains the events without these charts."""
+        others = {name for _, name in self.raised} - set(charts)
+        share = 1.0 - sum(self.shares[name] for name in charts)
+        return probability_of(self._count_events(others), self.rates * self.rows * share) >= UNLIKELY
+
+    def _count_events(self, names: Collection[str]) -> int:
+        """Number of separate events among the alarms of some charts."""
+        rows = [row for row, name in self.raised if name in names]
+        return len(rows) and 1 + sum(row - before > EVENT_ROWS for before, row in pairwise(rows))
+
+    @property
+    def arl0(self) -> float:
+        """Run length of each alarm, in rows."""
+        return self.opportunities / self.mean_count
 
 
 def check_training(
@@ -91,18 +122,32 @@ def check_training(
         trials = (strict, _watch(start(wide), aligned[half:], units))
     except InputError:  # too few rows, no output that can be watched after half of them, or limits that no chart has
         return TrainingCheck()
-    counts = [trial.count_at(strict.opportunities / strict.mean_count) for trial in trials if trial.is_unlikely]
-    return TrainingCheck(
-        strict.rows, strict.promise.found, strict.mean_count, max(counts, default=0.0) / strict.mean_count
-    )
+    excess, unlikely = 0.0, [trial for trial in trials if trial.is_unlikely]
+    excessive = [name for name in strict.shares if any(name in trial.excessive for trial in unlikely)]
+    if not _is_enough(set(strict.shares) - {*excessive}) or not all(trial.holds_without(excessive) for trial in trials):
+        excessive = []
+    if unlikely and not excessive:
+        events = [trial.promise.events for trial in trials]
+        excess = max(excess_by_events(events, [trial.arl0 for trial in trials], strict.opportunities), 1.5)
+    found = strict.promise.found - sum(name in excessive for _, name in strict.raised)
+    return TrainingCheck(strict.rows, found, strict.mean_count, excess, tuple(excessive))
+
+
+def _is_enough(charts: Collection[str]) -> bool:
+    """True if charts see more than slow changes."""
+    return bool(set(charts) - {Level.name})
 
 
 def _watch(pipeline: PlantPipeline, rows: Sequence[Row], units: list[str]) -> _Trial:
     """Watch rows with a trained pipeline."""
     promise = pipeline.evaluation.promises.promise
     assert promise is not None
-    for row in rows:
-        pipeline.update(row, units, [])
-    evaluation = pipeline.evaluation
-    opportunities = float(evaluation.memory.rows_watched * evaluation.chance_alarms)
-    return _Trial(promise, evaluation.memory.rows_watched, evaluation.promises.alarm_rates, opportunities)
+    evaluation, raised = pipeline.evaluation, list[tuple[int, str]]()
+    for index, row in enumerate(rows):
+        published: list[Publication] = []
+        pipeline.update(row, units, published)
+        alarms = [item.message for item in published if isinstance(item.message, Alarm)]
+        raised += [(index, alarm.alarm.partition("/")[0]) for alarm in alarms if alarm.event == RAISED]
+    watched, count = evaluation.memory.rows_watched, evaluation.chance_alarms
+    shares = {name: number / count for name, number in evaluation.charts.design.alarms_of_each.items()}
+    return _Trial(promise, watched, evaluation.promises.alarm_rates, float(watched * count), shares, raised)

@@ -66,7 +66,7 @@ def error_factor(e: Array, detectors: Sequence[Detector], arl0: float) -> float:
     largest = single.max(axis=1)
     for chart in detectors:
         values = np.nan_to_num(e[:, list(chart.signals)]) @ chart.matrix.T
-        average = np.linalg.norm(_ewma(values[None, None], chart.weight)[0, 0], axis=1)
+        average = np.linalg.norm(ewma(values[None, None], chart.weight)[0, 0], axis=1)
         count, window = chart.rule
         recent = np.lib.stride_tricks.sliding_window_view(np.concatenate([np.zeros(window - 1), average]), window)
         violated = np.sort(recent, axis=1)[:, -count]
@@ -127,7 +127,7 @@ def _chart_path(paths: Array, chart: Detector, horizons: Sequence[float], ramp_r
     if ramp_rows:
         signals = np.cumsum(signals, axis=2) / ramp_rows
     unit = sqrt(chart.weight / (2.0 - chart.weight))
-    smoothed = _ewma(signals, chart.weight) / unit
+    smoothed = ewma(signals, chart.weight) / unit
     nodes = np.unique(np.geomspace(1.0, rows, 40).round().astype(int))
     ends = np.concatenate([0.5 * (nodes[1:] + nodes[:-1] + 1), [rows + 1.0]])
     starts = np.concatenate([[1.0], ends[:-1]])
@@ -151,7 +151,7 @@ def _chart_path(paths: Array, chart: Detector, horizons: Sequence[float], ramp_r
     return _Path(mean, np.hstack([np.array(counts), late_rows]))
 
 
-def _ewma(signals: Array, weight: float) -> Array:
+def ewma(signals: Array, weight: float) -> Array:
     """EWMA of signals over their rows, the third axis; `scipy.signal` has it, and takes half a second to import."""
     if weight == 1.0:
         return signals

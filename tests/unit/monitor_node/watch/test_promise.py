@@ -4,6 +4,7 @@ False alarms are as many as promised, with noise that has a memory; `make faults
 """
 
 from collections import Counter
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from monitor_node.core import Monitor
 from monitor_node.replay import backtest
 from monitor_node.watch.promise import (
     PlantPromise,
-    extrapolate_count,
+    excess_by_events,
 )
 from reactorwatch.contract.messages_pb2 import Promise
 from reactorwatch.records.record import Record
@@ -116,10 +117,59 @@ def test_more_events_than_chance_explains_mean_that_the_plant_has_drifted() -> N
     assert not promise.has_drifted(int(2 * ROWS_IN_30_DAYS))  # four are promised until then
 
 
-def test_counts_at_other_limits_follow_from_a_common_factor_of_the_residuals() -> None:
-    """Limits 1.2 times too tight: run lengths are A^(1 / 1.44)."""
-    found = 4500.0 / 1500.0 ** (1 / 1.44)
-    assert extrapolate_count(round(found), 1500.0, 4500.0, 1e6) == pytest.approx(4500.0 / 1e6 ** (1 / 1.44), rel=0.1)
+@pytest.mark.parametrize("factor", [1.0, 1.2, 2.0])
+def test_the_excess_at_the_promised_limits_follows_from_a_common_factor_of_the_residuals(factor: float) -> None:
+    """Limits too tight by a factor: run lengths A are A^(1 / factor^2), and events Poisson counts of that."""
+    rng, found = np.random.default_rng(0), []
+    for _ in range(200):
+        events = [int(rng.poisson(5e4 / a ** (1.0 / factor**2))) for a in (1e6, 15_000.0)]
+        found.append(excess_by_events(events, [1e6, 15_000.0], 5e4))
+    assert np.median(found) == pytest.approx(1e6 ** (1.0 - 1.0 / factor**2), rel=0.5)
+
+
+@pytest.fixture(scope="module")
+def turned() -> Record:
+    """Two outputs of white noise whose correlation changes its sign in the middle of a training of 1,000 rows."""
+    rows, rng = 1500, np.random.default_rng(0)
+    first, other = rng.standard_normal((2, rows))
+    sign = np.where(np.arange(rows) < 500, 1.0, -1.0)
+    second = 0.95 * sign * first + np.sqrt(1.0 - 0.95**2) * other
+    return Record(0.1 * np.arange(rows, dtype=np.float64), {"a": first, "b": second}, "turned")
+
+
+ALONE: dict[str, Any] = {"inputs": (), "outputs": ("a", "b"), "charts": ("shewhart", "ewma", "mewma")}
+
+
+def test_a_chart_that_breaks_the_promise_in_the_training_is_left_out_and_its_share_goes_to_the_others(
+    turned: Record,
+) -> None:
+    """Each output alone is as before; only a chart of both sees the change, and would raise alarm after alarm."""
+    found = rw.backtest(turned, **ALONE, training_rows=1000, false_alarms_per_30_days=30.0)
+    assert found.notes == [
+        "training: mewma is left out: in the second half of the training it broke the promise; the others have its "
+        "false alarms"
+    ]
+    assert found.promise is not None
+    assert found.promise["kept"]
+    assert found.expected_false_alarms == pytest.approx(30.0 * 500 / ROWS_IN_30_DAYS, rel=0.01)
+    assert "no alarms came" in found.promise["text"]
+
+
+def test_a_stored_state_without_a_chart_that_was_left_out_resumes_bit_for_bit(turned: Record) -> None:
+    config = MonitorConfig(
+        **ALONE, training_rows=1000, isolation=False, process="", smallest_sd={}, priorities={},
+        false_alarms_per_30_days=30.0,
+    )  # fmt: skip
+    messages = messages_of(turned)
+    monitor, again = Monitor(config, 0, points=False), Monitor(config, 0, points=False)
+    for message in messages[:2600]:
+        monitor.on_message(message, 0)
+    again.from_bytes(monitor.to_bytes())
+    assert list(again.pipeline.evaluation.charts.memory.charts) == ["shewhart", "ewma"]
+    for message in messages[2600:]:
+        monitor.on_message(message, 0)
+        again.on_message(message, 0)
+    assert again.to_bytes() == monitor.to_bytes()
 
 
 def test_a_back_test_has_the_promise_for_the_rows_it_judged() -> None:
