@@ -28,6 +28,9 @@ WEIGHT = 1.0 / 20.0
 BLOCKS = 10
 """Blocks of a training, each predicted by a fit to the others."""
 
+MOST_LAGS = 1000
+"""Rows beyond which averages are not taken to be correlated: a hundred memories of the usual chart."""
+
 GAINS = np.append(0.0, np.geomspace(0.0005, 5.0, 33))
 """Values of g1 and g2 that are weighed; with the largest, an error as large as the noise is everywhere."""
 
@@ -123,14 +126,15 @@ def _rows(weight: float) -> float:
 
 def _rows_apart(averages: Array) -> float:
     """Number of rows after which squares of averages are independent (Bartlett 1946)."""
-    total = float(averages @ averages)
-    lags = range(1, len(averages) // 10)
+    total = max(float(averages @ averages), 1e-300)
+    lags = range(1, min(len(averages) // 10, MOST_LAGS))
     return 1.0 + 2.0 * sum((float(averages[k:] @ averages[:-k]) / total) ** 2 for k in lags)
 
 
 def average_inputs(inputs: Array) -> Array:
-    """Exponential averages of inputs, shape (n, inputs); a missing value is that of the row before."""
-    at = np.where(np.isfinite(inputs), np.arange(len(inputs))[:, None], 0)
+    """Exponential averages of inputs, shape (n, inputs); a missing value is that of the row before, or the first."""
+    known = np.isfinite(inputs)
+    at = np.where(known, np.arange(len(inputs))[:, None], np.argmax(known, axis=0))
     filled = np.nan_to_num(np.take_along_axis(inputs, np.maximum.accumulate(at, axis=0), axis=0))
     return np.asarray(filled[0] + ewma((filled - filled[0])[None, None], WEIGHT)[0, 0])
 

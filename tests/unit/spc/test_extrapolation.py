@@ -51,12 +51,20 @@ def test_a_lasting_error_that_grows_with_the_distance_is_found_to_its_size(outpu
 def test_averages_are_those_of_the_recursion_and_go_on_where_a_value_is_missing() -> None:
     rng = np.random.default_rng(0)
     u = rng.standard_normal((200, 2))
-    u[50:60, 0] = np.nan
-    expected, newest = u[0].copy(), u[0].copy()
+    u[50:60, 0] = u[:5, 1] = np.nan
+    newest = np.array([u[0, 0], u[5, 1]])  # before the first value, that is taken
+    expected = newest.copy()
     for row, found in zip(u, average_inputs(u), strict=True):
         newest = np.where(np.isfinite(row), row, newest)
         expected += WEIGHT * (newest - expected)
         np.testing.assert_allclose(found, expected, rtol=1e-9)
+
+
+def test_residuals_without_noise_show_no_growth() -> None:
+    found = fit_extrapolation(average_inputs(staircase(np.random.default_rng(0), 2)), np.zeros((ROWS, 1)), CHART)
+    assert found is not None
+    assert np.all(np.isfinite(found.sds_of_averages))
+    assert found.sds_of_averages.max() < 1.1
 
 
 @pytest.mark.parametrize("e", [np.full((ROWS, 2), np.nan), np.ones((9, 1))])
