@@ -408,7 +408,7 @@ def _simplification(has: Structure, wanted: Structure) -> str:
 
 def _few_moves(names: tuple[str, ...], inputs: Array) -> str:
     """Reason why the training cannot show how the outputs follow an input that hardly ever moved; empty if it can."""
-    counts = np.count_nonzero(np.nan_to_num(np.diff(inputs, axis=0)), axis=0).tolist()
+    counts = [_count_moves(column[np.isfinite(column)].tolist(), float(np.nanstd(column))) for column in inputs.T]
     few = [f"{name} ({count}; 5 are needed)" for name, count in zip(names, counts, strict=True) if 0 < count < 5]
     if not few:
         return ""
@@ -416,6 +416,15 @@ def _few_moves(names: tuple[str, ...], inputs: Array) -> str:
         f"the training has too few moves of {', '.join(few)}: at other set points false alarms may be more than "
         "promised; train over more set points"
     )
+
+
+def _count_moves(values: list[float], sd: float) -> int:
+    """Number of moves of an input by more than a quarter of its standard deviation: noise about one level is none."""
+    moves, level = 0, values[0] if values else 0.0
+    for value in values:
+        if abs(value - level) > 0.25 * sd:
+            moves, level = moves + 1, value
+    return moves
 
 
 def _predicts_as_well(candidate: _Candidate, identified: _Candidate) -> bool:

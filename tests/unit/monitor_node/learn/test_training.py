@@ -107,10 +107,12 @@ def test_the_process_model_of_another_plant_is_refused_in_one_line(setting: dict
         Monitor(MonitorConfig(**setting), 0)  # type: ignore[arg-type]
 
 
+@pytest.mark.parametrize("noise", [0.0, 0.02])
 @pytest.mark.parametrize(("moves", "is_too_few"), [(0, False), (1, True), (4, True), (5, False), (40, False)])
 def test_without_equations_a_training_with_few_moves_of_the_input_is_reported_not_to_keep_the_promise(
-    moves: int, is_too_few: bool
+    moves: int, is_too_few: bool, noise: float
 ) -> None:
+    """Noise of the recorded input about its level is no move, but an input that is noise alone moves."""
     generator = np.random.default_rng(moves)
     time_min = np.arange(1100) / 10
     u = np.where(np.arange(1100) * (moves + 1) // 1000 % 2, 1.0, 0.0)
@@ -121,7 +123,7 @@ def test_without_equations_a_training_with_few_moves_of_the_input_is_reported_no
     config = MonitorConfig(
         process="", inputs=("qc",), outputs=("T",), priorities={}, smallest_sd={}, isolation=False, training_min=100.0
     )
-    run = watched(time_min, {"qc": u, "T": y}, config)
+    run = watched(time_min, {"qc": u + noise * generator.standard_normal(u.size), "T": y}, config)
     few = [note for note in run.monitor.notes if "too few moves of qc" in note]
     assert bool(few) == is_too_few
     if is_too_few:
