@@ -408,7 +408,7 @@ def _simplification(has: Structure, wanted: Structure) -> str:
 
 def _few_moves(names: tuple[str, ...], inputs: Array) -> str:
     """Reason why the training cannot show how the outputs follow an input that hardly ever moved; empty if it can."""
-    counts = [_count_moves(column[np.isfinite(column)].tolist(), float(np.nanstd(column))) for column in inputs.T]
+    counts = [_count_moves(column[np.isfinite(column)]) for column in inputs.T]
     few = [f"{name} ({count}; 5 are needed)" for name, count in zip(names, counts, strict=True) if 0 < count < 5]
     if not few:
         return ""
@@ -418,11 +418,13 @@ def _few_moves(names: tuple[str, ...], inputs: Array) -> str:
     )
 
 
-def _count_moves(values: list[float], sd: float) -> int:
+def _count_moves(values: Array) -> int:
     """Number of moves of an input by more than a quarter of its standard deviation: noise about one level is none."""
-    moves, level = 0, values[0] if values else 0.0
-    for value in values:
-        if abs(value - level) > 0.25 * sd:
+    if not values.size:
+        return 0
+    moves, level, least = 0, float(values[0]), 0.25 * float(values.std())
+    for value in values.tolist():
+        if abs(value - level) > least:
             moves, level = moves + 1, value
     return moves
 

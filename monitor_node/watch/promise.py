@@ -172,7 +172,7 @@ def probability_of(found: int, expected: Array) -> float:
     return float(np.mean(pdtrc(found - 1, expected))) if found else 1.0
 
 
-def excess_by_events(events: Sequence[int], arl0: Sequence[float], opportunities: float) -> float:
+def excess_by_events(events: Sequence[int], arl0: Sequence[float], opportunities: Sequence[float]) -> float:
     """Times as many false alarms as promised, by the events that came with limits for several run lengths.
 
     Residuals larger than in the training by a factor have the logarithms of their run lengths divided by its square,
@@ -180,16 +180,16 @@ def excess_by_events(events: Sequence[int], arl0: Sequence[float], opportunities
     counts with all limits together holds for the first of them: with its own alone, one bad point of operation in a
     few hundred rows would stand for a rate.
 
-    >>> round(excess_by_events([0, 3], [1e6, 1500.0], 4500.0), 1)  # as many as intended
+    >>> round(excess_by_events([0, 3], [1e6, 1500.0], [4500.0, 4500.0]), 1)  # as many as intended
     1.0
 
     Args:
         events: number of separate events with each of the limits.
         arl0: run length for which these limits were.
-        opportunities: rows times alarms.
+        opportunities: rows without an active alarm, with each of the limits, times alarms.
     """
     g = np.linspace(0.02, 1.0, 99)
-    expected = opportunities / np.array(arl0)[:, None] ** g
+    expected = np.array(opportunities)[:, None] / np.array(arl0)[:, None] ** g
     fits = np.sum(np.array(events)[:, None] * np.log(expected) - expected, axis=0)
     return float(arl0[0] ** (1.0 - g[np.argmax(fits)]))
 

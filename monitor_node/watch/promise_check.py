@@ -45,7 +45,8 @@ class _Trial(NamedTuple):
         promise: the promise, with the alarms that came.
         rows: number of rows judged.
         rates: false alarms a row by the errors that the first half may have made, shape (draws,).
-        opportunities: rows times alarms that chance can raise.
+        alarms: number of alarms that chance can raise.
+        quiet_rows: number of rows without an active alarm: while one is, no other event comes.
         shares: share of each chart in these alarms, by name.
         raised: row and chart, or check, of each alarm.
     """
@@ -53,7 +54,8 @@ class _Trial(NamedTuple):
     promise: PlantPromise
     rows: int
     rates: Array
-    opportunities: float
+    alarms: int
+    quiet_rows: int
     shares: dict[str, float]
     raised: list[tuple[int, str]]
 
@@ -88,7 +90,7 @@ class _Trial(NamedTuple):
     @property
     def arl0(self) -> float:
         """Run length of each alarm, in rows."""
-        return self.opportunities / self.mean_count
+        return self.rows * self.alarms / self.mean_count
 
 
 def check_training(
@@ -107,19 +109,20 @@ def check_training(
         trained = learner.training.finish_early(times=2)  # with fewer rows it is too rough to judge the rest
         memory, learned = copy_of(learner.memory), copy_of(trained.reference.memory)
 
-        def start(config: MonitorConfig) -> PlantPipeline:
+        def start(config: MonitorConfig) -> tuple[PlantPipeline, Annunciator]:
             """A pipeline that starts with what was learned; its settings may differ in the false alarms."""
-            pipeline = PlantPipeline(config, Annunciator(config), points=False, model=model)
+            board = Annunciator(config)
+            pipeline = PlantPipeline(config, board, points=False, model=model)
             pipeline.resume(copy_of(memory), 0)
             reference = learned.reference(pipeline.baselines.equations, config.outputs, pipeline.models)
             pipeline.start(trained._replace(reference=reference, checks=list(trained.checks)))
-            return pipeline
+            return pipeline, board
 
-        strict = _watch(start(settings), aligned[half:], units)
+        strict = _watch(*start(settings), aligned[half:], units)
         # so that some alarms are expected with the wider limits
         per_30_days = min(strict.promise.per_30_days * 3.0 / strict.mean_count, LARGEST_FALSE_ALARMS)
         wide = msgspec.structs.replace(settings, false_alarms_per_30_days=per_30_days)
-        trials = (strict, _watch(start(wide), aligned[half:], units))
+        trials = (strict, _watch(*start(wide), aligned[half:], units))
     except InputError:  # too few rows, no output that can be watched after half of them, or limits that no chart has
         return TrainingCheck()
     excess, unlikely = 0.0, [trial for trial in trials if trial.is_unlikely]
@@ -127,8 +130,9 @@ def check_training(
     if not _is_enough(set(strict.shares) - {*excessive}) or not all(trial.holds_without(excessive) for trial in trials):
         excessive = []
     if unlikely and not excessive:
-        events = [trial.promise.events for trial in trials]
-        excess = max(excess_by_events(events, [trial.arl0 for trial in trials], strict.opportunities), 1.5)
+        counts = [(trial.promise.events, trial.arl0, float(trial.quiet_rows * trial.alarms)) for trial in trials]
+        share = strict.quiet_rows / max(strict.rows, 1)  # events come in the rows without an alarm only
+        excess = max(share * excess_by_events(*zip(*counts, strict=True)), 1.5)
     found = strict.promise.found - sum(name in excessive for _, name in strict.raised)
     return TrainingCheck(strict.rows, found, strict.mean_count, excess, tuple(excessive))
 
@@ -138,16 +142,17 @@ def _is_enough(charts: Collection[str]) -> bool:
     return bool(set(charts) - {Level.name})
 
 
-def _watch(pipeline: PlantPipeline, rows: Sequence[Row], units: list[str]) -> _Trial:
+def _watch(pipeline: PlantPipeline, board: Annunciator, rows: Sequence[Row], units: list[str]) -> _Trial:
     """Watch rows with a trained pipeline."""
     promise = pipeline.evaluation.promises.promise
     assert promise is not None
-    evaluation, raised = pipeline.evaluation, list[tuple[int, str]]()
+    evaluation, raised, quiet_rows = pipeline.evaluation, list[tuple[int, str]](), 0
     for index, row in enumerate(rows):
         published: list[Publication] = []
+        quiet_rows += not board.has_unexplained
         pipeline.update(row, units, published)
         alarms = [item.message for item in published if isinstance(item.message, Alarm)]
         raised += [(index, alarm.alarm.partition("/")[0]) for alarm in alarms if alarm.event == RAISED]
     watched, count = evaluation.memory.rows_watched, evaluation.chance_alarms
     shares = {name: number / count for name, number in evaluation.charts.design.alarms_of_each.items()}
-    return _Trial(promise, watched, evaluation.promises.alarm_rates, float(watched * count), shares, raised)
+    return _Trial(promise, watched, evaluation.promises.alarm_rates, count, quiet_rows, shares, raised)

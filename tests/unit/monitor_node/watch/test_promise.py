@@ -123,7 +123,7 @@ def test_the_excess_at_the_promised_limits_follows_from_a_common_factor_of_the_r
     rng, found = np.random.default_rng(0), []
     for _ in range(200):
         events = [int(rng.poisson(5e4 / a ** (1.0 / factor**2))) for a in (1e6, 15_000.0)]
-        found.append(excess_by_events(events, [1e6, 15_000.0], 5e4))
+        found.append(excess_by_events(events, [1e6, 15_000.0], [5e4, 5e4]))
     assert np.median(found) == pytest.approx(1e6 ** (1.0 - 1.0 / factor**2), rel=0.5)
 
 
