@@ -114,7 +114,7 @@ class ChartDesign:
     @property
     def chance_alarms(self) -> int:
         """Number of alarms of the chosen charts that chance can raise."""
-        return _count_alarms(self.chosen, sum(self.evaluated), len(self.signals))
+        return sum(self.alarms_of_each.values())
 
     def _complete_values(self, values: Array) -> tuple[tuple[str, ...], Array]:
         """Names of the signals with values that vary, and the rows in which none of them is missing."""

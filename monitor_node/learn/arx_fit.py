@@ -24,7 +24,7 @@ from reactorwatch.identification.linear import fit_linear
 from reactorwatch.identification.linear_model import standard_deviations
 from reactorwatch.identification.structure import Structure
 from reactorwatch.spc.charts.parameters import learn
-from reactorwatch.spc.extrapolation import FittedExtrapolation
+from reactorwatch.spc.extrapolation import BLOCKS, FittedExtrapolation
 
 ROWS_A_PARAMETER = 10
 """Least number of rows per parameter of a fitted model."""
@@ -142,7 +142,7 @@ def _best_structure(structures: Sequence[Structure], rows: RowArrays, outputs: A
 
 
 def held_out_residuals(regressors: Array, y: Array) -> tuple[Array, Array]:
-    """Residuals of each of ten blocks by the least-squares fit to the others, and the leverages of its rows.
+    """Residuals of each of `BLOCKS` blocks by the least-squares fit to the others, and the leverages of its rows.
 
     With the hat matrix H of the fit to all, the residuals of a block are (I - H_bb)^-1 times those of that fit, and
     their variances by the error of the other fit, in units of the noise's, the diagonal of (I - H_bb)^-1 - I (Cook &
@@ -156,7 +156,7 @@ def held_out_residuals(regressors: Array, y: Array) -> tuple[Array, Array]:
     u, sizes, _ = np.linalg.svd(regressors, full_matrices=False)
     basis = u * (sizes / np.hypot(sizes, 1e-5 * sizes[0]))
     residual, leverage = y - basis @ (basis.T @ y), np.empty(len(y))
-    for block in np.array_split(np.arange(len(y)), 10):
+    for block in np.array_split(np.arange(len(y)), BLOCKS):
         part = basis[block]
         passed = np.linalg.solve(np.eye(len(sizes)) - part.T @ part, part.T)
         leverage[block] = np.einsum("ij,ji->i", part, passed)

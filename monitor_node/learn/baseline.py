@@ -37,7 +37,7 @@ from reactorwatch.errors import InputError
 from reactorwatch.identification.structure import Structure
 from reactorwatch.kalman.noise_estimation import resolution_sd
 from reactorwatch.process.model import ProcessModel
-from reactorwatch.spc.detection import ewma
+from reactorwatch.spc.averages import ewma
 from reactorwatch.spc.extrapolation import FittedExtrapolation, average_inputs, fit_extrapolation
 from reactorwatch.spc.prewhitening import LARGEST_ORDER, Prewhitening, learn
 from reactorwatch.spc.step_test import ROWS as STEP_ROWS
@@ -298,7 +298,7 @@ class _Choice:
         errors = np.stack([reference.held_out, identified.z])
         errors = errors[:, np.isfinite(errors).any(axis=2).all(axis=0)]
         weight = float(self._config.chart_settings["ewma_weight"])
-        sizes = np.sqrt(np.mean(np.square(ewma(np.nan_to_num(errors[None]), weight)[0]), axis=1))
+        sizes = np.sqrt(np.mean(np.square(ewma(np.nan_to_num(errors), weight)), axis=1))
         known = np.isfinite(errors).any(axis=(0, 1))
         ratio = np.log(np.maximum(sizes[0], 1e-300)) - np.log(np.maximum(sizes[1], 1e-300))
         return float(np.mean(ratio[known])) <= log(LARGER)

@@ -70,22 +70,20 @@ class _Trial(NamedTuple):
         return probability_of(self.promise.events, self.rates * self.rows) < UNLIKELY
 
     @property
-    def excessive(self) -> dict[str, int]:
-        """Number of events of each chart for which chance hardly explains so many."""
-        counts = {name: self._count_events({name}) for name in self.shares}
-        expected = {name: self.rates * self.rows * share for name, share in self.shares.items()}
-        return {name: count for name, count in counts.items() if probability_of(count, expected[name]) < UNLIKELY}
+    def excessive(self) -> set[str]:
+        """Charts of whose events chance hardly explains so many."""
+        return {name for name, share in self.shares.items() if not self._holds({name}, share)}
 
     def holds_without(self, charts: Collection[str]) -> bool:
         """True if chance explains the events without these charts."""
         others = {name for _, name in self.raised} - set(charts)
-        share = 1.0 - sum(self.shares[name] for name in charts)
-        return probability_of(self._count_events(others), self.rates * self.rows * share) >= UNLIKELY
+        return self._holds(others, 1.0 - sum(self.shares[name] for name in charts))
 
-    def _count_events(self, names: Collection[str]) -> int:
-        """Number of separate events among the alarms of some charts."""
+    def _holds(self, names: Collection[str], share: float) -> bool:
+        """True if chance explains the separate events of some charts and checks, given their share in the alarms."""
         rows = [row for row, name in self.raised if name in names]
-        return len(rows) and 1 + sum(row - before > EVENT_ROWS for before, row in pairwise(rows))
+        events = len(rows) and 1 + sum(row - before > EVENT_ROWS for before, row in pairwise(rows))
+        return probability_of(events, self.rates * self.rows * share) >= UNLIKELY
 
     @property
     def arl0(self) -> float:
@@ -127,7 +125,8 @@ def check_training(
         return TrainingCheck()
     excess, unlikely = 0.0, [trial for trial in trials if trial.is_unlikely]
     excessive = [name for name in strict.shares if any(name in trial.excessive for trial in unlikely)]
-    if not _is_enough(set(strict.shares) - {*excessive}) or not all(trial.holds_without(excessive) for trial in trials):
+    seen_by_others = {*strict.shares} - {*excessive, Level.name}  # a chart of levels sees slow changes only
+    if not (seen_by_others and all(trial.holds_without(excessive) for trial in trials)):
         excessive = []
     if unlikely and not excessive:
         counts = [(trial.promise.events, trial.arl0, float(trial.quiet_rows * trial.alarms)) for trial in trials]
@@ -135,11 +134,6 @@ def check_training(
         excess = max(share * excess_by_events(*zip(*counts, strict=True)), 1.5)
     found = strict.promise.found - sum(name in excessive for _, name in strict.raised)
     return TrainingCheck(strict.rows, found, strict.mean_count, excess, tuple(excessive))
-
-
-def _is_enough(charts: Collection[str]) -> bool:
-    """True if charts see more than slow changes."""
-    return bool(set(charts) - {Level.name})
 
 
 def _watch(pipeline: PlantPipeline, board: Annunciator, rows: Sequence[Row], units: list[str]) -> _Trial:

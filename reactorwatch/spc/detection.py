@@ -21,6 +21,7 @@ import numpy as np
 from scipy import linalg, special
 
 from reactorwatch.arrays import Array
+from reactorwatch.spc.averages import ewma
 from reactorwatch.spc.false_alarm_budget import return_level
 from reactorwatch.spc.run_length import false_alarm_rates
 
@@ -66,7 +67,7 @@ def error_factor(e: Array, detectors: Sequence[Detector], arl0: float) -> float:
     largest = single.max(axis=1)
     for chart in detectors:
         values = np.nan_to_num(e[:, list(chart.signals)]) @ chart.matrix.T
-        average = np.linalg.norm(ewma(values[None, None], chart.weight)[0, 0], axis=1)
+        average = np.linalg.norm(ewma(values, chart.weight), axis=1)
         count, window = chart.rule
         recent = np.lib.stride_tricks.sliding_window_view(np.concatenate([np.zeros(window - 1), average]), window)
         violated = np.sort(recent, axis=1)[:, -count]
@@ -149,23 +150,6 @@ def _chart_path(paths: Array, chart: Detector, horizons: Sequence[float], ramp_r
         late_rows = np.repeat(beyond[:, None] / late_nodes, late_nodes, axis=1)
     mean = np.concatenate([np.linalg.norm(smoothed[:, :, nodes - 1], axis=3), late_size], axis=2)
     return _Path(mean, np.hstack([np.array(counts), late_rows]))
-
-
-def ewma(signals: Array, weight: float) -> Array:
-    """EWMA of signals over their rows, the third axis; `scipy.signal` has it, and takes half a second to import."""
-    if weight == 1.0:
-        return signals
-    size = 64  # rows that are smoothed at once
-    lag = np.subtract.outer(np.arange(size), np.arange(size))
-    weights = np.where(lag >= 0, weight * (1.0 - weight) ** np.maximum(lag, 0), 0.0)
-    kept = ((1.0 - weight) ** np.arange(1, size + 1))[:, None]
-    smoothed, last = np.empty_like(signals), np.zeros_like(signals[:, :, :1])
-    for start in range(0, signals.shape[2], size):
-        block = signals[:, :, start : start + size]
-        rows = block.shape[2]
-        smoothed[:, :, start : start + rows] = weights[:rows, :rows] @ block + kept[:rows] * last
-        last = smoothed[:, :, start + rows - 1 : start + rows]
-    return smoothed
 
 
 def _miss_log_probability(chart: Detector, path: _Path, sizes: Array) -> Array:

@@ -19,7 +19,7 @@ import msgspec
 import numpy as np
 
 from reactorwatch.arrays import Array
-from reactorwatch.spc.detection import ewma
+from reactorwatch.spc.averages import ewma, independent_rows
 from reactorwatch.stored_state import Storable
 
 WEIGHT = 1.0 / 20.0
@@ -103,14 +103,15 @@ def fit_extrapolation(averages: Array, e: Array, weight: float) -> FittedExtrapo
     if not e.shape[1] or np.count_nonzero(known) < BLOCKS * e.shape[1]:
         return None
     white = np.nan_to_num(e) @ _standardise(e[known])[1].T
-    smoothed = ewma(white[None, None], weight)[0, 0] * sqrt(_rows(weight))
+    smoothed = ewma(white, weight) * sqrt(_rows(weight))
     near = np.minimum(distances, np.quantile(distances, 0.98))  # one far block is not to choose the combination
     _, directions = np.linalg.eigh((smoothed.T * near) @ smoothed)
-    squares = np.square(smoothed @ directions[:, -1])[known]
-    rows_apart = _rows_apart(smoothed @ directions[:, -1])
+    combined = smoothed @ directions[:, -1:]
+    squares = np.square(combined[known, 0])
+    share = independent_rows(combined, min(len(combined) // 10, MOST_LAGS)) / len(combined)
     gains, powers = np.meshgrid(GAINS, (1.0, 2.0))
     variances = 1.0 + _rows(weight) * gains[..., None] * distances[known] ** powers[..., None]
-    fits = -0.5 / rows_apart * np.sum(np.log(variances) + squares / variances, axis=2)
+    fits = -0.5 * share * np.sum(np.log(variances) + squares / variances, axis=2)
     posterior = np.exp(fits - fits.max())
     of_each = np.sum(posterior * gains, axis=1) / posterior.sum()
     centre, root = _standardise(averages)
@@ -124,19 +125,12 @@ def _rows(weight: float) -> float:
     return (2.0 - weight) / weight
 
 
-def _rows_apart(averages: Array) -> float:
-    """Number of rows after which squares of averages are independent (Bartlett 1946)."""
-    total = max(float(averages @ averages), 1e-300)
-    lags = range(1, min(len(averages) // 10, MOST_LAGS))
-    return 1.0 + 2.0 * sum((float(averages[k:] @ averages[:-k]) / total) ** 2 for k in lags)
-
-
 def average_inputs(inputs: Array) -> Array:
     """Exponential averages of inputs, shape (n, inputs); a missing value is that of the row before, or the first."""
     known = np.isfinite(inputs)
     at = np.where(known, np.arange(len(inputs))[:, None], np.argmax(known, axis=0))
     filled = np.nan_to_num(np.take_along_axis(inputs, np.maximum.accumulate(at, axis=0), axis=0))
-    return np.asarray(filled[0] + ewma((filled - filled[0])[None, None], WEIGHT)[0, 0])
+    return np.asarray(filled[0] + ewma(filled - filled[0], WEIGHT))
 
 
 def _standardise(values: Array) -> tuple[Array, Array]:

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from reactorwatch.arrays import Array
 from reactorwatch.codegen.numba_kernel import Entry, jit
+from reactorwatch.spc.averages import ewma
 
 LARGEST_ORDER = 6
 """Largest number of coefficients: a filter has room for so many past values."""
@@ -165,10 +166,7 @@ def memory_sds(e: Array, weight: float, doubt: float = 3.0) -> tuple[float, ...]
     sds = []
     for column in e.T:
         column = column[np.isfinite(column)]
-        average, squares = 0.0, 0.0
-        for value in column.tolist():
-            average += weight * (value - average)
-            squares += average * average
+        squares = float(np.sum(ewma(column[:, None], weight) ** 2))
         ratio = squares / max(len(column), 1) * (2.0 - weight) / weight
         independent = max(len(column) * weight / 2.0, 1.0)
         sds.append(sqrt(ratio) if ratio > 1.0 + doubt * sqrt(2.0 / independent) else 1.0)

@@ -37,6 +37,7 @@ import numpy as np
 from scipy import special
 
 from reactorwatch.arrays import Array, block_bounds
+from reactorwatch.spc.averages import ewma
 
 FEWEST_SAMPLES = 10
 """Least number of samples beside two for each input; of fewer, Student's limits are beyond what a fault does."""
@@ -110,10 +111,10 @@ class SlowLevels(NamedTuple):
         centres, spacing = values.mean(axis=0), sample_spacing(weight)
         count = len(values) // spacing - 1
         driving = np.zeros((len(values), k, LAGS))
-        driving[:, :, 0] = averages_from_zero(values[:, :k] - centres[:k], weight)
+        driving[:, :, 0] = ewma(values[:, :k] - centres[:k], weight)
         for lag in range(1, LAGS):
-            driving[:, :, lag] = averages_from_zero(driving[:, :, 0], weight * 0.25 ** (lag - 1))
-        averages = averages_from_zero(values[:, k:] - centres[k:], weight)
+            driving[:, :, lag] = ewma(driving[:, :, 0], weight * 0.25 ** (lag - 1))
+        averages = ewma(values[:, k:] - centres[k:], weight)
         sampled = slice(len(values) - 1 - (count - 1) * spacing, None, spacing)
         y, memories = averages[sampled], np.geomspace(0.2, 0.5 * count, MEMORIES)  # in samples
         shown = np.array([1.0, *(weight * 0.25**lag for lag in range(LAGS - 1))]) * len(values) >= 2 * FEWEST_SAMPLES
@@ -264,14 +265,6 @@ def crossing_rate(limit: Array, step: Array) -> Array:
     """
     bounded = np.minimum(step, 2.0)
     return np.asarray(4.0 * special.owens_t(limit, np.sqrt(bounded / (4.0 - bounded))))
-
-
-def averages_from_zero(rows: Array, weight: float) -> Array:
-    """Exponentially weighted averages of rows from 0 on, same shape."""
-    averages, average = np.empty_like(rows), np.zeros(rows.shape[1])
-    for index, row in enumerate(rows):
-        averages[index] = average = average + weight * (row - average)
-    return averages
 
 
 def _innovations(rows: Array, r: float) -> Array:

@@ -37,6 +37,7 @@ from scipy import special
 from reactorwatch.arrays import Array, block_bounds
 from reactorwatch.codegen.numba_kernel import Entry, jit
 from reactorwatch.errors import InputError, positive
+from reactorwatch.spc.averages import independent_rows
 from reactorwatch.spc.charts.base import LARGEST_VALUE, Judgement, Setting, vector
 from reactorwatch.spc.charts.ewma import ewma_limit
 from reactorwatch.spc.charts.value_chart import (
@@ -209,22 +210,10 @@ def held_out_deviations(scaled: Array, weight: float) -> tuple[Array, float, flo
     residuals = held_out_residuals(scaled)
     averages = average_rows(residuals, weight)
     white = np.mean(residuals**2, axis=0) * weight / (2.0 - weight)
-    ratios, freedom = moderate(np.mean(averages**2, axis=0) / white, degrees_of_freedom(averages, weight))
+    lags = min(int(10.0 / weight), len(averages) // 2)  # up to ten memories of an average
+    ratios, freedom = moderate(np.mean(averages**2, axis=0) / white, independent_rows(averages, lags))
     sds = np.sqrt(white * np.maximum(ratios, 1.0))
     return sds, freedom, float(np.max(np.abs(averages) / sds))
-
-
-def degrees_of_freedom(averages: Array, weight: float) -> float:
-    """Degrees of freedom of the mean square of each average.
-
-    Args:
-        averages: averages, shape (rows, p).
-        weight: lambda.
-    """
-    rows, sums = len(averages), np.sum(averages**2, axis=0)
-    lags = range(1, min(int(10.0 / weight), rows // 2))  # up to ten memories of an average
-    squares = [float(np.mean(np.sum(averages[k:] * averages[:-k], axis=0) / sums)) ** 2 for k in lags]
-    return rows / (1.0 + 2.0 * sum(squares))
 
 
 def moderate(ratios: Array, freedom: float) -> tuple[Array, float]:

@@ -26,11 +26,11 @@ from scipy import special
 
 from reactorwatch.arrays import BLOCKS, Array
 from reactorwatch.errors import positive
+from reactorwatch.spc.averages import ewma
 from reactorwatch.spc.charts.base import ROWS_A_SIGNAL, Chart, Judgement, vector
 from reactorwatch.spc.charts.ewma import ewma_limit
 from reactorwatch.spc.false_alarm_budget import TrainingErrors, degrees_of_freedom, student_tail
 from reactorwatch.spc.prewhitening import Prewhitening, learn
-from reactorwatch.spc.slow_levels import averages_from_zero
 from reactorwatch.stored_state import Memory
 
 SHRINKAGE = 0.01
@@ -166,7 +166,7 @@ def average_rows(residuals: Array, weight: float) -> Array:
         residuals: held-out residuals, shape (rows, p).
         weight: lambda.
     """
-    return averages_from_zero(residuals, weight)[min(int(2.0 / weight), len(residuals) // 2) :]
+    return ewma(residuals, weight)[min(int(2.0 / weight), len(residuals) // 2) :]
 
 
 # --- averages of statistics ------------------------------------------------------------------------------------

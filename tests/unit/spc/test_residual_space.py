@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from reactorwatch.arrays import BLOCKS
-from reactorwatch.spc.charts.residual_space import ResidualSpace, degrees_of_freedom, held_out_residuals, moderate
+from reactorwatch.spc.averages import independent_rows
+from reactorwatch.spc.charts.residual_space import ResidualSpace, held_out_residuals, moderate
 from reactorwatch.spc.charts.value_chart import SHRINKAGE, ValueBaseline, adjustment, average_rows
 
 from .members import Array
@@ -64,7 +65,7 @@ def test_averages_of_white_residuals_have_their_variance_and_the_freedom_of_thei
     """An average of weight 0.1 has the autocorrelation 0.9^k, so 1 / (1 + 2 sum 0.81^k) = 0.105 of the rows count."""
     averages = average_rows(np.random.default_rng(4).standard_normal((20_000, 10)), 0.1)
     assert np.mean(averages**2, axis=0) * 1.9 / 0.1 == pytest.approx(1.0, abs=0.15)
-    assert degrees_of_freedom(averages, 0.1) == pytest.approx(20_000 * 0.19 / 1.81, rel=0.05)
+    assert independent_rows(averages, 100) == pytest.approx(20_000 * 0.19 / 1.81, rel=0.05)
 
 
 @pytest.mark.parametrize("prior", [6.0, 1e9])
